@@ -1,0 +1,104 @@
+"""How good a belief is, measured on steps that it has not been trained on yet."""
+
+import math
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_belief.belief import ActionLayout, BeliefOutput, action_loss, kl_divergence
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
+from sb3_belief.belief_ppo.extractor import BeliefFusion
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+
+# Enough for two digits, and a small part of an update's time
+PROBE_ROWS = 256
+
+
+@th.no_grad()
+def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict[str, float]:
+    """
+    :param policy: A policy with a belief
+    :param buffer: Its rollout, complete, before the update that trains on it
+    :return: By name, over up to 256 active steps spread evenly over the rollout:
+        ``action_loss`` (eq. 7) and ``kl``, as they enter eq. 8 before their weights;
+        ``accuracy`` of the most likely action of each visible other, and ``base_rate``, that of always naming each other's
+        most frequent action (only for discrete actions);
+        ``history_gain``, how much the action loss rises when the history's actions are shuffled across its rows (0 while
+        the history is empty);
+        ``attention_entropy``, of the attention weights, in nats, at most log N_h;
+        ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
+        ``visible_fraction``, share of the others that are visible;
+        ``first_log_ratio``, largest |log ratio| of the policies that acted and that is trained: 0 but for rounding
+    """
+    rows = np.flatnonzero(buffer.active)
+    rows = rows[np.linspace(0, len(rows) - 1, min(PROBE_ROWS, len(rows))).astype(int)]
+    step = np.unravel_index(rows, buffer.active.shape)
+    minibatch = buffer.belief_minibatch(step)
+    raw = buffer.observations
+    observations = obs_as_tensor({k: v[step] for k, v in raw.items()} if isinstance(raw, dict) else raw[step], policy.device)
+    flat = policy.flat_observations(observations)
+
+    assert policy.belief is not None and policy.history is not None
+    history = policy.history
+    output = policy.belief(flat, history, minibatch.noise, minibatch.kept)
+    owners = th.as_tensor(policy.layout.owners, device=flat.device)
+
+    def loss(prediction: th.Tensor) -> float:
+        return float(action_loss(prediction, minibatch.others_actions, minibatch.others_visible, owners))
+
+    measured = dict(
+        action_loss=loss(output.prediction),
+        kl=float(kl_divergence(output.mean, output.log_std)),
+        visible_fraction=float(minibatch.others_visible.float().mean()),
+        attention_entropy=float(-(output.weights * output.weights.clamp(min=1e-12).log()).sum(dim=1).mean()),
+        history_gain=0.0,
+        first_log_ratio=_first_log_ratio(policy, buffer, step, observations, minibatch),
+    )
+    if history.valid.any():
+        with_shuffled = history._replace(actions=_shuffled(history.actions, history.valid))
+        shuffled = policy.belief(flat, with_shuffled, minibatch.noise, minibatch.kept)
+        measured["history_gain"] = loss(shuffled.prediction) - measured["action_loss"]
+    if isinstance(policy.mlp_extractor, BeliefFusion):
+        measured["fusion_ratio"] = policy.mlp_extractor.belief_share()
+    accuracy, base_rate = _accuracies(output, minibatch, policy.layout)
+    if not math.isnan(accuracy):
+        measured["accuracy"], measured["base_rate"] = accuracy, base_rate
+    return measured
+
+
+def _shuffled(actions: th.Tensor, valid: th.Tensor) -> th.Tensor:
+    """The valid rows in an arbitrary but fixed order: drawing one would shift the stream that the update draws from."""
+    rows = valid.nonzero().flatten()
+    order = th.as_tensor(np.random.default_rng(0).permutation(len(rows)), device=actions.device)
+    result = actions.clone()
+    result[rows] = actions[rows[order]]
+    return result
+
+
+def _first_log_ratio(
+    policy: BeliefPolicyMixin,
+    buffer: BeliefBufferMixin,
+    step: tuple[np.ndarray, ...],
+    observations: th.Tensor | dict[str, th.Tensor],
+    minibatch: BeliefMinibatch,
+) -> float:
+    actions = buffer.to_torch(buffer.actions[step])
+    if isinstance(policy.action_space, spaces.Discrete):
+        actions = actions.long().flatten()
+    policy.stage(minibatch)
+    _, log_prob, _ = policy.evaluate_actions(observations, actions)
+    return float((log_prob - buffer.to_torch(buffer.log_probs[step])).abs().max())
+
+
+def _accuracies(output: BeliefOutput, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:
+    """Accuracy and base rate over all visible discrete actions; not a number where there are none."""
+    right = most_frequent = total = 0
+    for owner, start, width in layout.blocks:
+        visible = minibatch.others_visible[:, owner]
+        taken = minibatch.others_actions[visible, start : start + width].argmax(dim=1)
+        right += int((output.prediction[visible, start : start + width].argmax(dim=1) == taken).sum())
+        most_frequent += int(taken.bincount(minlength=width).max())
+        total += len(taken)
+    return (right / total, most_frequent / total) if total else (math.nan, math.nan)

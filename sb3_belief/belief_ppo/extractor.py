@@ -1,0 +1,170 @@
+"""The features extractor that puts a belief about the others beside the features of the observation."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
+
+from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
+
+
+def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
+    """
+    :param observation: A preprocessed observation (batch first), or a dict of them
+    :return: One row an observation, ``[B, d_o]``; the parts of a dict in the order of its keys
+    """
+    if isinstance(observation, dict):
+        return th.cat([observation[key].flatten(1).float() for key in sorted(observation)], dim=1)
+    return observation.flatten(1).float()
+
+
+class BeliefExtractor(BaseFeaturesExtractor):
+    """
+    Features of the observation and, beside them, the belief about the others: ``[B, features + z]``.
+
+    The history belongs to the weights: it is kept in buffers, and so is saved, loaded and moved with the policy. How the
+    belief is drawn is said by :meth:`conditioned`; without it the belief is its mean.
+
+    :param observation_space: The agent's observation space
+    :param features: Extractor of the features of the observation itself
+    :param belief: The belief network
+    :param history_length: ``T_h``, how many of its own steps the agent remembers
+    :param detach_belief: Whether to keep the gradient of policy and value out of the belief network
+    """
+
+    history_observations: th.Tensor
+    history_actions: th.Tensor
+    history_valid: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        features: BaseFeaturesExtractor,
+        belief: DynamicBelief,
+        history_length: int,
+        detach_belief: bool,
+    ) -> None:
+        super().__init__(observation_space, features.features_dim + belief.latent_dim)
+        self.features = features
+        self.belief = belief
+        self.detach_belief = detach_belief
+        for name, rows in empty_history(history_length, belief.observation_dim, belief.action_dim)._asdict().items():
+            self.register_buffer(f"history_{name}", rows)
+        #: What the last pass believed, and the noise it drew; for whoever called it
+        self.output: BeliefOutput | None = None
+        self.noise: th.Tensor | None = None
+        self._given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
+        self._context: tuple[tuple[tuple[int, int], ...], HistoryContext] | None = None
+
+    @property
+    def history(self) -> History:
+        """The history the belief is inferred from at present."""
+        return History(self.history_observations, self.history_actions, self.history_valid)
+
+    def remember(self, observations: th.Tensor, actions: th.Tensor) -> None:
+        """
+        :param observations: Preprocessed flat observations of further steps, oldest first, ``[N, d_o]``
+        :param actions: The others' actions at those steps, ``[N, W]``, zero where not visible
+        """
+        history = append_rows(self.history, observations, actions)
+        self.history_observations, self.history_actions, self.history_valid = history
+
+    @contextmanager
+    def conditioned(
+        self, noise: th.Tensor | None = None, kept: th.Tensor | None = None, sample: bool = False
+    ) -> Iterator[None]:
+        """
+        How the belief of the passes within is drawn.
+
+        :param noise: The noise of eq. 5, ``[B, z]``
+        :param kept: The history rows to attend to, ``[B, N_h]``
+        :param sample: Whether to draw the noise
+        """
+        self._given = (noise, kept, sample)
+        try:
+            yield
+        finally:
+            self._given = (None, None, False)
+
+    def forward(self, observations: th.Tensor | TensorDict) -> th.Tensor:
+        noise, kept, sample = self._given
+        flat = flatten_observation(observations)
+        if sample:
+            noise = th.randn(len(flat), self.belief.latent_dim, device=flat.device)
+        context = None if th.is_grad_enabled() else self._cached_context()
+        self.output = self.belief(flat, self.history, noise, kept, context)
+        self.noise = noise
+        latent = self.output.latent.detach() if self.detach_belief else self.output.latent
+        return th.cat([self.features(observations), latent], dim=1)
+
+    def _cached_context(self) -> HistoryContext:
+        """
+        Between two updates neither weights nor history change, so the encoded history is kept. Whether they did is told by
+        PyTorch's version counters, which every optimiser step and every load moves: no caller has to think of it.
+        """
+        tensors = [*self.belief.parameters(), *self.history]
+        state = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors)
+        if self._context is None or self._context[0] != state:
+            self._context = state, self.belief.encode_history(self.history)
+        return self._context[1]
+
+
+class BeliefFusion(nn.Module):
+    """
+    Policy and value networks that fuse features and belief (Sec. 4.2): each has a base of its own on the features, beside
+    whose output the shared belief is put, and a linear layer. The paper lets another linear layer follow at once, which
+    would be one linear map; hence the activation between them.
+
+    :param features_dim: Width of the features of the observation
+    :param latent_dim: ``z``, width of the belief
+    :param net_arch: Layers of the bases, as SB3 takes them; the fusion is as wide as the last one
+    :param activation_fn: Activation within the bases
+    :param fusion_activation_fn: Activation after the fusion; ``torch.nn.Identity`` for the paper's literal two linear layers
+    :param device: Device of the weights
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        latent_dim: int,
+        net_arch: list[int] | dict[str, list[int]],
+        activation_fn: type[nn.Module],
+        fusion_activation_fn: type[nn.Module],
+        device: th.device | str,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = latent_dim
+        self.base = MlpExtractor(features_dim, net_arch, activation_fn, device)
+        self.latent_dim_pi = self.base.latent_dim_pi
+        self.latent_dim_vf = self.base.latent_dim_vf
+        self.fuse_pi = nn.Linear(self.latent_dim_pi + latent_dim, self.latent_dim_pi, device=device)
+        self.fuse_vf = nn.Linear(self.latent_dim_vf + latent_dim, self.latent_dim_vf, device=device)
+        self.activation = fusion_activation_fn()
+
+    def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: Output of :class:`BeliefExtractor`
+        :return: Latent codes of policy and value
+        """
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: th.Tensor) -> th.Tensor:
+        own, latent = features[:, : -self.latent_dim], features[:, -self.latent_dim :]
+        return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(own), latent], dim=1)))
+
+    def forward_critic(self, features: th.Tensor) -> th.Tensor:
+        own, latent = features[:, : -self.latent_dim], features[:, -self.latent_dim :]
+        return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(own), latent], dim=1)))
+
+    def belief_share(self) -> float:
+        """
+        :return: Summed absolute fusion weights on the belief over those on everything, in [0, 1] (Fig. 5e of the paper)
+        """
+        with th.no_grad():
+            weights = [self.fuse_pi.weight.abs(), self.fuse_vf.weight.abs()]
+            belief = sum(float(weight[:, -self.latent_dim :].sum()) for weight in weights)
+            return belief / sum(float(weight.sum()) for weight in weights)

@@ -1,0 +1,72 @@
+"""What a model knows of the others: how their actions are flattened into one vector, and how to read them from `info`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_belief.belief import ActionLayout
+
+ActionSpaces = dict[str, spaces.Space]
+
+
+def action_layout(others_action_spaces: Mapping[str, spaces.Space]) -> ActionLayout:
+    """
+    :param others_action_spaces: The others' action spaces, in the fixed order of the others
+    :return: Where each of them stands in the flattened vector: one-hot for Discrete, a one-hot a dimension for
+        MultiDiscrete, the numbers themselves for Box and MultiBinary
+    """
+    widths: list[list[int]] = []
+    categorical: list[bool] = []
+    for name, space in others_action_spaces.items():
+        if isinstance(space, spaces.Discrete):
+            widths.append([int(space.n)])
+        elif isinstance(space, spaces.MultiDiscrete):
+            widths.append([int(n) for n in space.nvec.flatten()])
+        elif isinstance(space, (spaces.Box, spaces.MultiBinary)):
+            widths.append([spaces.flatdim(space)])
+        else:
+            raise ValueError(
+                f"{name} has the action space {space}; a belief can be held about Discrete, MultiDiscrete, MultiBinary "
+                "and Box actions. Flatten its action space in the environment."
+            )
+        categorical.append(isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)))
+    return ActionLayout(widths, categorical)
+
+
+def others_of(env: VecEnv) -> ActionSpaces:
+    """
+    :param env: The vectorised environment of one agent
+    :return: The others' action spaces in order, empty for an environment without others
+    """
+    try:
+        found = env.get_attr("others_action_spaces")[0]
+    except AttributeError:
+        return {}
+    return dict(found)
+
+
+def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param infos: One step's `info` of each env copy
+    :param layout: Whose actions are expected
+    :return: The others' actions, float32 ``[n_envs, W]``, zero where not visible, and visibility, bool
+        ``[n_envs, n_others]``. Zeroed here once more, so that a careless environment cannot leak what the agent did not see
+    """
+    try:
+        actions = np.stack([info["others_actions"] for info in infos]).astype(np.float32, copy=False)
+        visible = np.stack([info["others_visible"] for info in infos]).astype(bool, copy=False)
+    except KeyError as missing:
+        raise ValueError(
+            f"the environment names others in 'others_action_spaces', but its info lacks {missing}; every step must bring "
+            "'others_actions' and 'others_visible' (a Team provides both)"
+        ) from None
+    expected = (len(infos), layout.width), (len(infos), layout.n_others)
+    if (actions.shape, visible.shape) != expected:
+        raise ValueError(
+            f"info brings others_actions of shape {actions.shape[1:]} and others_visible of shape {visible.shape[1:]}; "
+            f"the others' action spaces ask for {expected[0][1:]} and {expected[1][1:]}"
+        )
+    return np.where(visible[:, layout.owners], actions, np.float32(0.0)), visible
