@@ -1,0 +1,53 @@
+# Every target works from a fresh clone: the virtual environment is made first and kept up to date with setup.cfg and constraints.txt.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SOURCES := sb3_belief tests benchmarks train.py
+DEMO_ARGS ?=
+PYTEST_ARGS ?=
+
+.PHONY: help install demo test pytest lint type format check-codestyle commit-checks clean
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
+
+install: $(STAMP)  ## make the virtual environment
+
+# torch comes first and by its tested version: a range would make the resolver fetch several builds of it
+$(STAMP): setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "Python 3.10 or later is needed: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+		{ echo "$(PYTHON) cannot make virtual environments (Debian and Ubuntu: apt-get install python3-venv)"; exit 1; }
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[tests,plots]'
+	@touch $@
+
+demo: $(STAMP)  ## train a team of BeliefPPO agents on Traffic Junction and show what it learned
+	$(BIN)/sb3-belief demo $(DEMO_ARGS)
+
+test: $(STAMP)  ## run all tests
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+pytest: test
+
+lint: $(STAMP)  ## look for mistakes
+	$(BIN)/ruff check $(SOURCES)
+
+type: $(STAMP)  ## check the types
+	$(BIN)/mypy $(SOURCES)
+
+format: $(STAMP)  ## sort imports and format the code
+	$(BIN)/ruff check --select I --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+check-codestyle: $(STAMP)  ## check imports and format, changing nothing
+	$(BIN)/ruff check --select I $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+
+commit-checks: format type lint  ## what to run before a commit
+
+clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,8 @@
+"""Train a team: ``python train.py --algo belief_ppo --env traffic-junction-medium``. The same as ``sb3-belief train``."""
+
+import sys
+
+from sb3_belief.zoo.cli import train_main
+
+if __name__ == "__main__":
+    sys.exit(train_main())
