@@ -1,0 +1,178 @@
+"""The command line: ``sb3-belief train | enjoy | demo``."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+
+from sb3_belief.zoo.errors import ConfigError
+
+_ALGO, _ENV = "belief_ppo", "traffic-junction-medium"
+_PAIRS = "key:value pairs; values are read as YAML, a dot names a nested key"
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    :return: the parser of ``sb3-belief``
+    """
+    parser = argparse.ArgumentParser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
+    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | demo")
+    _add_train(commands.add_parser("train", help="train a team from a YAML configuration", **_STYLE))
+    _add_enjoy(commands.add_parser("enjoy", help="replay a trained team", **_STYLE))
+    _add_demo(commands.add_parser("demo", help="train, measure and show a team on Traffic Junction", **_STYLE))
+    return parser
+
+
+_STYLE: dict = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter, "allow_abbrev": False}
+
+
+_LIST: dict = {"nargs": "+", "action": "extend", "default": []}
+
+
+def _positive(text: str) -> int:
+    value = int(float(text))
+    if value < 1 or value != float(text):
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not {text}")
+    return value
+
+
+def _positive_or_off(text: str) -> int:
+    return -1 if text == "-1" else _positive(text)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"for the environment: {_PAIRS}")
+    parser.add_argument("--device", default="auto", help="cpu, cuda, ... or auto")
+    parser.add_argument(
+        "--allow-package",
+        **_LIST,
+        metavar="NAME",
+        help="further packages that dotted paths in the configuration may point into",
+    )
+
+
+def _add_train(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--algo", help=f"algorithm of every agent (default: {_ALGO}, with -i the saved team's)")
+    parser.add_argument("--env", help=f"id of the environment (default: {_ENV}, with -i the saved team's)")
+    parser.add_argument("-n", "--n-timesteps", type=_positive, help="joint steps, instead of the configuration's")
+    parser.add_argument("--seed", type=int, help="of the team and its environments; left out: drawn and written down")
+    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+    parser.add_argument("-tb", "--tensorboard-log", help="folder for TensorBoard")
+    parser.add_argument("--eval-freq", type=_positive_or_off, default=25_000, help="evaluate every N joint steps, -1: never")
+    parser.add_argument("--eval-episodes", type=_positive, default=100, help="episodes of an evaluation")
+    parser.add_argument("--n-eval-envs", type=_positive, default=50, help="environment copies of an evaluation")
+    parser.add_argument("--save-freq", type=_positive_or_off, default=-1, help="save every N joint steps, -1: at the end only")
+    parser.add_argument("-params", **_LIST, metavar="K:V", help=f"settings: {_PAIRS}")
+    parser.add_argument("-conf", "--conf-file", help="YAML file instead of zoo_configs/<algo>.yml")
+    parser.add_argument(
+        "--vec-env", choices=["dummy", "subproc"], default="dummy", help="in this process, or a process per copy"
+    )
+    parser.add_argument("--num-threads", type=_positive_or_off, default=1, help="threads of torch, -1 for torch's own choice")
+    parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
+    parser.add_argument("-i", "--trained-agent", help="a run's folder or a team's zip to go on from")
+    parser.add_argument("--verbose", type=int, choices=[0, 1, 2], default=1, help="0 for silence, 1 for tables")
+    _add_common(parser)
+
+
+def _add_enjoy(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", help="a run's folder, or a team's zip in it")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--episodes", type=_positive, default=1, help="stop after that many episodes")
+    length.add_argument("-n", "--n-timesteps", type=_positive, help="or after that many steps")
+    manner = parser.add_mutually_exclusive_group()
+    manner.add_argument("--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily")
+    manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
+    parser.add_argument("--seed", type=int, default=0, help="of the environment")
+    parser.add_argument("--output", help="a .gif or .mp4 file; left out: a window")
+    parser.add_argument("--fps", type=_positive, help="frames per second of the file; left out: the environment's own")
+    _add_common(parser)
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    from sb3_belief.zoo.demo import EPISODES, TIMESTEPS
+
+    parser.add_argument("-n", "--n-timesteps", type=_positive, default=TIMESTEPS, help="joint steps to train for")
+    parser.add_argument("--episodes", type=_positive, default=EPISODES, help="episodes of each measurement")
+    parser.add_argument("--seed", type=int, default=0, help="of the team and its environments")
+    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    The command ``sb3-belief``.
+
+    :param argv: the words after the command's name; None: those of the process
+    :return: exit status: 0, 2 if something was refused, 130 after Ctrl-C
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    args = make_parser().parse_args(argv)
+    action = {"train": _train, "enjoy": _enjoy, "demo": _demo}[args.subcommand]
+    return _run(action, args, ["sb3-belief", *argv])
+
+
+def train_main(argv: Sequence[str] | None = None) -> int:
+    """
+    The script ``train.py``, which is ``sb3-belief train``.
+
+    :param argv: the words after the script's name; None: those of the process
+    :return: exit status, as ``main``
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(prog="train.py", description="Train a team from a YAML configuration.", **_STYLE)
+    _add_train(parser)
+    return _run(_train, parser.parse_args(argv), ["python", "train.py", *argv])
+
+
+def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.Namespace, command: list[str]) -> int:
+    try:
+        return action(args, command)
+    except ConfigError as error:
+        print(f"Refused: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+
+
+# torch and Stable-Baselines3 take seconds to import: not for --help
+
+
+def _train(args: argparse.Namespace, command: list[str]) -> int:
+    from sb3_belief.zoo.config import load_config
+    from sb3_belief.zoo.resume import resume_config
+    from sb3_belief.zoo.train import TrainOptions, train
+
+    rest = (args.conf_file, args.params, args.env_kwargs, args.n_timesteps, tuple(args.allow_package))
+    if args.trained_agent is None:
+        config = load_config(args.algo or _ALGO, args.env or _ENV, *rest)
+    else:
+        config = resume_config(args.trained_agent, args.algo, args.env, *rest)
+    names = (
+        "seed log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
+        " vec_env device num_threads progress trained_agent verbose"
+    )
+    options = TrainOptions(**{name: getattr(args, name) for name in names.split()}, command=command)
+    return 0 if train(config, options).finished else 130
+
+
+def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
+    from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
+
+    names = "run episodes n_timesteps deterministic seed output fps device"
+    enjoy(
+        EnjoyOptions(
+            **{name: getattr(args, name) for name in names.split()},
+            env_kwargs=tuple(args.env_kwargs),
+            extra_packages=tuple(args.allow_package),
+        )
+    )
+    return 0
+
+
+def _demo(args: argparse.Namespace, command: list[str]) -> int:
+    from sb3_belief.zoo.demo import demo
+
+    return demo(args.n_timesteps, args.episodes, args.seed, args.log_folder, command)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Watch a trained team: in a window, or as a GIF or MP4."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_belief.envs.registry import make_parallel_env
+from sb3_belief.team import Team, TeamVecEnv, make_team_env
+from sb3_belief.zoo.config import RunConfig, load_config
+from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.evaluate import Outcome
+from sb3_belief.zoo.run_folder import find_team, run_of
+
+VIDEO_FORMATS = (".gif", ".mp4")
+
+
+@dataclass(frozen=True)
+class EnjoyOptions:
+    """
+    :param run: a run's folder, or a team's zip in it
+    :param episodes: stop after that many episodes
+    :param n_timesteps: or after that many steps, if given
+    :param deterministic: whether the agents do what they think best, or sample
+    :param seed: of the environment
+    :param output: ``.gif`` or ``.mp4`` file; None for a window
+    :param fps: frames per second of the file, None for the environment's own
+    :param env_kwargs: ``key:value`` pairs that win over those of the run
+    :param extra_packages: see ``names.resolve``
+    :param device: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
+    """
+
+    run: str
+    episodes: int = 1
+    n_timesteps: int | None = None
+    deterministic: bool = True
+    seed: int = 0
+    output: str | None = None
+    fps: int | None = None
+    env_kwargs: tuple[str, ...] = ()
+    extra_packages: tuple[str, ...] = ()
+    device: str = "auto"
+
+
+def enjoy(options: EnjoyOptions) -> Outcome:
+    """
+    Replay a trained team and print what it earns.
+
+    :param options: what to show
+    :return: returns and successes of the finished episodes
+    :raises ConfigError: if there is no such team, or it cannot be shown as asked
+    """
+    if options.output is not None and Path(options.output).suffix.lower() not in VIDEO_FORMATS:
+        raise ConfigError(f"--output: {options.output!r} must end in {' or '.join(VIDEO_FORMATS)}.")
+    path = find_team(options.run, "enjoy")
+    config = _config_of(path, options)
+    env = _make_env(config, options)
+    try:
+        team = Team.load(path, env=env, device=options.device)
+        frames: list[np.ndarray] | None = None if options.output is None else []
+        outcome = _play(team, env, options, frames)
+        if options.output is not None and frames:
+            fps = options.fps or _frame_rate(config)
+            write_video(Path(options.output), frames, fps)
+            print(f"Wrote {len(frames)} frames to {options.output}")
+    finally:
+        env.close()
+    _print_summary(outcome)
+    return outcome
+
+
+def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
+    """
+    :param path: ``.gif`` or ``.mp4`` file; its folder is made if need be
+    :param frames: pictures, uint8 [height, width, 3]
+    :param fps: frames per second
+    :raises ConfigError: if imageio is not installed
+    """
+    try:
+        import imageio.v2 as imageio
+    except ImportError as error:
+        raise ConfigError(f"Writing {path.name} needs imageio: pip install 'sb3-belief[plots]'.") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".gif":
+        imageio.mimsave(path, frames, duration=1000 / fps, loop=0)  # type: ignore[arg-type]
+    else:
+        imageio.mimsave(path, frames, fps=fps, macro_block_size=2)  # type: ignore[arg-type]
+
+
+def _frame_rate(config: RunConfig) -> int:
+    # SB3's vectorised environments do not pass this on
+    env = make_parallel_env(config.env_id, **config.env_kwargs)
+    rate = env.metadata.get("render_fps", 10)
+    env.close()
+    return int(rate)
+
+
+def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
+    run = run_of(team)
+    if run is None:
+        raise ConfigError(
+            f"enjoy: {str(team)!r} lies in no run's folder (no config.yml and run.json), so its environment is not known."
+        )
+    algo, env_id, conf_file = run
+    config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=options.extra_packages)
+    render_mode = "human" if options.output is None else "rgb_array"
+    return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode})
+
+
+def _make_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:
+    try:
+        return make_team_env(config.env_id, seed=options.seed, env_kwargs=config.env_kwargs, wrapper=config.wrapper)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"enjoy: {config.env_id} refuses its settings: {error}") from error
+
+
+def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.ndarray] | None) -> Outcome:
+    returns: list[float] = []
+    successes: list[bool] = []
+    steps = 0
+    state: Any = None
+    episode_start = np.ones(1, dtype=bool)
+    try:
+        obs = env.reset()
+        while len(returns) < options.episodes if options.n_timesteps is None else steps < options.n_timesteps:
+            if frames is not None:
+                frames.append(np.asarray(env.render(mode="rgb_array")))
+            actions, state = team.predict(obs, state, episode_start, options.deterministic, action_masks=env.action_masks())
+            obs, _, dones, infos = env.step(actions)
+            steps += 1
+            episode_start = dones
+            if dones[0]:
+                returns.append(infos[0]["episode"]["r"])
+                if "is_success" in infos[0]:
+                    successes.append(bool(infos[0]["is_success"]))
+                success = f"  {'success' if successes[-1] else 'no success'}" if "is_success" in infos[0] else ""
+                print(f"Episode {len(returns)}: return {returns[-1]:.3f}, {infos[0]['episode']['l']} steps{success}")
+    except KeyboardInterrupt:
+        print("Interrupted.")
+    except RuntimeError as error:
+        if options.output is not None:
+            raise
+        # pygame without a screen
+        raise ConfigError(f"enjoy: cannot open a window ({error}). To a file instead: --output episode.gif") from error
+    return Outcome(np.array(returns, dtype=float), np.array(successes, dtype=bool))
+
+
+def _print_summary(outcome: Outcome) -> None:
+    if outcome.returns.size == 0:
+        print("No episode ended.")
+        return
+    print(f"Mean return over {outcome.returns.size} episodes: {outcome.returns.mean():.3f} (std {outcome.returns.std():.3f})")
+    if outcome.success_rate is not None:
+        print(f"Success rate: {outcome.success_rate:.3f}")

@@ -1,0 +1,30 @@
+"""What a user sees when a setting is refused."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class ConfigError(ValueError):
+    """A setting refused before anything started. The message names its place, what is allowed and the nearest match."""
+
+
+def nearest(given: object, allowed: Iterable[str]) -> str:
+    """
+    :param given: what was typed
+    :param allowed: what could have been typed
+    :return: `` Did you mean 'x'?`` (with the leading space), or nothing if no name is near
+    """
+    near = difflib.get_close_matches(str(given), list(allowed), n=2, cutoff=0.5)
+    return f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def unknown(where: str, kind: str, given: object, allowed: Iterable[str]) -> ConfigError:
+    """
+    :param where: file and section, or flag
+    :param kind: what was to be named, e.g. ``"key"``
+    :param given: the name that does not exist
+    :param allowed: the names that do
+    :return: the error to raise
+    """
+    names = list(allowed)
+    return ConfigError(f"{where}: unknown {kind} {given!r}.{nearest(given, names)} Allowed: {', '.join(names) or 'none'}.")

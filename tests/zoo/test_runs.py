@@ -1,0 +1,261 @@
+import csv
+import json
+import os
+import signal
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_belief.envs import TrafficJunction
+from sb3_belief.team import Team, make_team_env
+from sb3_belief.zoo.cli import main, train_main
+
+EASY = "traffic-junction-easy"
+# small enough for seconds, large enough for two iterations
+TINY = {
+    "ppo": ["n_envs:4", "n_steps:20", "batch_size:40", "n_epochs:1"],
+    "belief_ppo": ["n_envs:4", "n_steps:20", "batch_size:40", "n_epochs:1", "history_length:40"],
+}
+
+
+def train_tiny(algo, folder, *words):
+    flags = ["--env", EASY, "--seed", "3", "-f", str(folder), "--verbose", "0", "--eval-freq", "-1", "-params", *TINY[algo]]
+    return train_main(["--algo", algo, *flags, *words])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run of PPO: its folder, with everything that a run can write."""
+    folder = tmp_path_factory.mktemp("runs")
+    words = ["-n", "160", "--eval-freq", "80", "--eval-episodes", "6", "--n-eval-envs", "3", "--save-freq", "80"]
+    assert train_tiny("ppo", folder / "logs", *words, "-tb", str(folder / "tb")) == 0
+    return folder / "logs" / "ppo" / f"{EASY}_1"
+
+
+def read_csv(path, skip=0):
+    with open(path) as file:
+        for _ in range(skip):
+            next(file)
+        return list(csv.DictReader(file))
+
+
+def test_a_run_writes_its_configuration_and_record(run):
+    settings = yaml.safe_load((run / "config.yml").read_text())[EASY]
+    assert (settings["n_timesteps"], settings["n_steps"], settings["env_kwargs"]) == (160, 20, {"reward_scale": 0.1})
+    record = json.loads((run / "run.json").read_text())
+    assert (record["status"], record["algo"], record["env"], record["seed"]) == ("finished", "ppo", EASY, 3)
+    assert record["timesteps"] == 160 and record["versions"]["torch"]
+    assert record["command"].startswith("python train.py --algo ppo --env traffic-junction-easy --seed 3")
+
+
+def test_a_run_writes_monitors_of_the_team_and_of_each_agent(run):
+    team = read_csv(run / "monitor.csv", skip=1)
+    assert [row["l"] for row in team] == ["20"] * 8  # 160 joint steps
+    agents = {f"car_{i}": read_csv(run / "agents" / f"car_{i}.monitor.csv", skip=1) for i in range(5)}
+    # the team's reward is the mean of its agents'
+    mean = np.mean([[float(row["r"]) for row in rows] for rows in agents.values()], axis=0)
+    np.testing.assert_allclose([float(row["r"]) for row in team], mean, atol=1e-5)
+    for i in range(5):
+        assert len(read_csv(run / "agents" / f"car_{i}" / "progress.csv")) == 2
+
+
+def test_a_run_writes_progress_evaluations_and_tensorboard(run):
+    assert {int(row["time/total_timesteps"]) for row in read_csv(run / "progress.csv")} >= {80, 160}
+    with np.load(run / "evaluations.npz") as data:
+        assert data["timesteps"].tolist() == [80, 160]
+        assert data["results"].shape == data["successes"].shape == (2, 6)
+    events = (run.parents[2] / "tb" / "ppo" / EASY / "Team_1").rglob("events.out*")
+    assert len(list(events)) == 6  # the team and five cars
+
+
+@pytest.mark.parametrize("name", ["team", "best_model", "checkpoints/team_80_steps", "checkpoints/team_160_steps"])
+def test_a_run_writes_teams_that_load(run, name):
+    team = Team.load(run / f"{name}.zip")
+    assert list(team.agents) == [f"car_{i}" for i in range(5)]
+    obs = make_team_env(EASY, n_envs=2, seed=0).reset()
+    actions, _ = team.predict(obs, deterministic=True)
+    assert actions["car_4"].shape == (2,)
+
+
+def test_the_same_seed_gives_the_same_run(tmp_path):
+    for _ in range(2):
+        assert train_tiny("ppo", tmp_path, "-n", "160") == 0
+    first, second = (read_csv(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1) for k in (1, 2))
+    assert [row["r"] for row in first] == [row["r"] for row in second]
+
+
+def test_belief_ppo_runs_in_a_checkout_that_is_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # configurations are found from any folder, runs are written to this one
+    assert train_main(["--env", EASY, "-n", "160", "--eval-freq", "-1", "--verbose", "0", "-params", *TINY["belief_ppo"]]) == 0
+    folder = tmp_path / "logs" / "belief_ppo" / f"{EASY}_1"
+    rows = read_csv(folder / "progress.csv")
+    assert float(rows[-1]["belief/action_loss"]) > 0
+    assert json.loads((folder / "run.json").read_text())["seed"] >= 0  # drawn, and written down
+
+
+@pytest.mark.parametrize("algo", ["ippo", "a2c", "dqn", "maskable_ppo", "recurrent_ppo", "trpo", "qrdqn"])
+def test_every_algorithm_for_discrete_actions_runs_in_a_team(algo, tmp_path):
+    small = ["n_envs:2", "policy_kwargs.net_arch:[8]"]
+    if algo in ("dqn", "qrdqn"):
+        small += ["learning_starts:8", "buffer_size:100", "batch_size:8"]
+    else:
+        small += ["n_steps:8"] + ([] if algo == "a2c" else ["batch_size:16"])
+    flags = ["--env", EASY, "-n", "32", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+    assert train_main(["--algo", algo, *flags, "-params", *small]) == 0
+    team = Team.load(tmp_path / algo / f"{EASY}_1" / "team.zip")
+    assert team.num_timesteps >= 32
+
+
+def test_a_run_goes_on_from_a_saved_team(run, tmp_path):
+    words = ["-i", str(run), "-n", "80", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+    assert main(["train", *words]) == 0
+    folder = tmp_path / "ppo" / f"{EASY}_1"
+    record = json.loads((folder / "run.json").read_text())
+    assert (record["timesteps"], record["trained_agent"]) == (160 + 80, str(run / "team.zip"))
+    before, after = (Team.load(path / "team.zip").agents["car_0"] for path in (run, folder))
+    assert after._n_updates > before._n_updates
+    assert vars(after)["n_steps"] == 20  # the saved run's own setting, not zoo_configs/ppo.yml's
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-params", "n_steps:40"], "'n_steps' cannot be set with -i, the saved models bring their settings"),
+        (["-params", "n_env:40"], "Did you mean 'n_envs'"),
+        (["--algo", "a2c"], "'a2c' does not fit the saved team, which is of 'ppo'"),
+        (["--env", "traffic-junction-medium"], "cannot be set up on traffic-junction-medium"),
+    ],
+)
+def test_what_does_not_fit_a_saved_team_is_refused(words, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "-i", str(run), "--eval-freq", "-1", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch, capsys):
+    (tmp_path / "press_ctrl_c.py").write_text(
+        "import os, signal\n"
+        "from stable_baselines3.common.callbacks import BaseCallback\n"
+        "class Press(BaseCallback):\n"
+        "    def _on_step(self):\n"
+        "        if self.num_timesteps == 120:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "        return True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["-n", "800", "--allow-package", "press_ctrl_c", "-params", "callback:press_ctrl_c.Press"]
+    # a process started in the background ignores the signal
+    old = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        status = train_tiny("ppo", tmp_path / "logs", *words)
+    finally:
+        signal.signal(signal.SIGINT, old)
+        sys.modules.pop("press_ctrl_c", None)
+    assert status == 130
+    folder = tmp_path / "logs" / "ppo" / f"{EASY}_1"
+    said = capsys.readouterr().out
+    assert "Interrupted after 120 joint steps" in said and str(folder / "team.zip") in said
+    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
+    assert Team.load(folder / "team.zip").num_timesteps == 120
+
+
+def test_a_run_that_fails_says_so_in_its_record(tmp_path, monkeypatch):
+    (tmp_path / "break_down.py").write_text(
+        "from stable_baselines3.common.callbacks import BaseCallback\n"
+        "class Break(BaseCallback):\n"
+        "    def _on_step(self):\n"
+        "        raise OSError('disk full')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(OSError, match="disk full"):
+        train_tiny(
+            "ppo", tmp_path / "logs", "-n", "80", "--allow-package", "break_down", "-params", "callback:break_down.Break"
+        )
+    sys.modules.pop("break_down", None)
+    assert json.loads((tmp_path / "logs" / "ppo" / f"{EASY}_1" / "run.json").read_text())["status"] == "failed"
+
+
+def test_wrappers_change_what_the_agents_see(tmp_path):
+    words = ["-n", "80", "-params", "env_wrapper:{supersuit.frame_stack_v1: {stack_size: 3}}"]
+    assert train_tiny("ppo", tmp_path, *words) == 0
+    folder = tmp_path / "ppo" / f"{EASY}_1"
+    plain = make_team_env(EASY).reset()["car_0"].shape[1]
+    assert Team.load(folder / "team.zip").agents["car_0"].observation_space.shape == (3 * plain,)
+    # and the team is replayed behind the same wrapper
+    output = tmp_path / "episode.gif"
+    assert main(["enjoy", str(folder), "--output", str(output)]) == 0
+    assert output.stat().st_size > 0
+
+
+def test_normalize_gives_each_agent_its_own_statistics(tmp_path):
+    assert train_tiny("ppo", tmp_path, "-n", "80", "-params", "normalize:{norm_reward: false}") == 0
+    team = Team.load(tmp_path / "ppo" / f"{EASY}_1" / "team.zip")
+    obs = make_team_env(EASY, n_envs=2, seed=0).reset()
+    assert team.normalize == {"norm_reward": False}
+    assert set(team.predict(obs)[0]) == set(team.agents)
+
+
+def test_worker_processes_give_the_same_run(tmp_path):
+    returns = []
+    for k, vec_env in enumerate(("dummy", "subproc"), start=1):
+        flags = ["--env", EASY, "-n", "40", "--seed", "3", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+        settings = ["n_envs:2", "n_steps:20", "batch_size:40"]
+        assert train_main(["--algo", "ppo", *flags, "--vec-env", vec_env, "-params", *settings]) == 0
+        rows = read_csv(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1)
+        returns.append([(row["r"], row["is_success"]) for row in rows])
+    assert len(returns[0]) == 2 and returns[0] == returns[1]
+
+
+@pytest.mark.parametrize(
+    ("ending", "manner"), [("gif", "--deterministic"), ("gif", "--stochastic"), ("mp4", "--deterministic")]
+)
+def test_enjoy_writes_an_episode(ending, manner, run, tmp_path, capsys):
+    imageio = pytest.importorskip("imageio.v2")
+    output = tmp_path / "videos" / f"episode.{ending}"
+    assert (
+        main(["enjoy", str(run), "--output", str(output), "--episodes", "2", manner, "--env-kwargs", "arrival_rate:0.0"]) == 0
+    )
+    frames = imageio.mimread(output, memtest=False)
+    assert len(frames) == 40 and frames[0].ndim == 3
+    said = capsys.readouterr().out
+    # no car ever comes: nothing can go wrong
+    assert "Mean return over 2 episodes: 0.000" in said and "Success rate: 1.000" in said
+
+
+def test_enjoy_counts_steps_if_asked(run, tmp_path, capsys):
+    assert main(["enjoy", str(run / "best_model.zip"), "--output", str(tmp_path / "a.gif"), "-n", "5"]) == 0
+    assert "Wrote 5 frames" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("words", "fps"), [([], TrafficJunction.metadata["render_fps"]), (["--fps", "20"], 20)])
+def test_enjoy_plays_at_the_pace_of_the_environment_or_as_asked(words, fps, run, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    output = tmp_path / "a.gif"
+    assert main(["enjoy", str(run), "--output", str(output), *words]) == 0
+    # a GIF counts in hundredths of a second
+    assert image.open(output).info["duration"] == pytest.approx(1000 / fps, abs=10)
+
+
+def test_enjoy_opens_a_window(run, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    assert main(["enjoy", str(run), "-n", "3"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "enjoy: no file or folder 'nowhere'"),
+        (["RUN", "--output", "episode.avi"], "--output: 'episode.avi' must end in .gif or .mp4"),
+        (["RUN", "--env-kwargs", "arival_rate:0.1"], "Did you mean 'arrival_rate'"),
+        (["stray.zip"], "lies in no run's folder"),
+    ],
+)
+def test_what_enjoy_refuses(words, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stray.zip").touch()
+    assert main(["enjoy", *(str(run) if word == "RUN" else word for word in words)]) == 2
+    assert message in capsys.readouterr().err
+    assert os.listdir(tmp_path) == ["stray.zip"]
