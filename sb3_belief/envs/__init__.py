@@ -1,0 +1,6 @@
+"""Environments: a registry of ids, and this package's own PettingZoo environments."""
+
+from sb3_belief.envs.registry import EnvSpec, make_batched_env, make_parallel_env, registered_ids, spec
+from sb3_belief.envs.traffic_junction import TrafficJunction
+
+__all__ = ["EnvSpec", "TrafficJunction", "make_batched_env", "make_parallel_env", "registered_ids", "spec"]

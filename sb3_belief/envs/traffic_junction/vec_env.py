@@ -1,0 +1,167 @@
+"""Many Traffic Junctions stepped at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_belief.envs.traffic_junction.config import JunctionConfig
+from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, Step, TrafficCore
+from sb3_belief.envs.traffic_junction.observation import Observer
+from sb3_belief.envs.traffic_junction.parallel_env import (
+    RENDER_MODES,
+    TrafficJunction,
+    action_masks,
+    agent_names,
+    check_render_mode,
+)
+from sb3_belief.envs.traffic_junction.rendering import Renderer
+from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
+
+
+class TrafficJunctionVecEnv(TeamVecEnv):
+    """
+    ``num_envs`` copies of :class:`TrafficJunction` in one numpy core. Copy i seeded with s + i (as ``seed(s)`` does)
+    lives the same life, bit for bit, as one :class:`TrafficJunction` that was reset with the seed s + i and then without
+    one.
+
+    :param num_envs: number of copies
+    :param render_mode: None, ``"rgb_array"`` or ``"human"`` (a window with the first copy)
+    :param env_kwargs: the other arguments of :class:`TrafficJunction`
+    :raises ValueError: for a value that is not allowed
+    """
+
+    def __init__(self, num_envs: int, render_mode: str | None = None, **env_kwargs: Any):
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} must be at least 1.")
+        self.config = JunctionConfig(**env_kwargs)
+        self.core = TrafficCore(num_envs, self.config)
+        self._observer = Observer(self.core)
+        self._renderer: Renderer | None = None
+        agents = agent_names(self.config)
+        layout = self._observer.layout
+        super().__init__(
+            num_envs,
+            agents,
+            {agent: layout.space() for agent in agents},
+            {agent: spaces.Discrete(2) for agent in agents},
+            render_mode=check_render_mode(render_mode),
+        )
+        self._sees_now = np.zeros((num_envs, len(agents), len(agents)), dtype=bool)
+        self._no_life_end = np.zeros((num_envs, len(agents)), dtype=bool)
+
+    def _reset_joint(self) -> TeamObs:
+        for copy, seed in enumerate(self._seeds):
+            if seed is not None:
+                self.core.seed(copy, seed)
+        self.core.reset()
+        obs = self._observe()
+        self._show()
+        return obs
+
+    def _step_joint(self, actions: TeamObs) -> TeamStep:
+        joint = np.stack([actions[agent] for agent in self.possible_agents], axis=1)
+        if not ((joint == GAS) | (joint == BRAKE)).all():
+            raise ValueError(f"Actions must be {GAS} (gas) or {BRAKE} (brake), got {np.unique(joint).tolist()}.")
+        saw = self._observer.of_others(self._sees_now)
+        result = self.core.step(joint)
+        infos = self._infos(result, saw)
+        obs = self._observe()
+        # drawn before the reset, so that a window shows the last step too
+        self._show()
+        ended = np.flatnonzero(result.dones)
+        if len(ended):
+            for copy in ended:
+                infos[copy]["is_success"] = bool(self.core.n_collisions[copy] == 0)
+                infos[copy]["TimeLimit.truncated"] = True
+                infos[copy]["terminal_observation"] = {agent: values[copy] for agent, values in obs.items()}
+            self.core.reset(ended)
+            obs = self._observe()
+        return obs, result.rewards.mean(axis=1).astype(np.float32), result.dones, infos
+
+    def _infos(self, result: Step, saw: np.ndarray) -> list[dict[str, Any]]:
+        rewards = result.rewards.astype(np.float32)
+        life_end = result.left if self.config.reward == "own" else self._no_life_end
+        truncated = result.dones[:, None] & ~life_end
+        return [
+            {"agent_rewards": reward, "visible": visible, "active": active, "life_end": life, "truncated": cut}
+            for reward, visible, active, life, cut in zip(rewards, saw, result.acted, life_end, truncated, strict=True)
+        ]
+
+    def _observe(self) -> TeamObs:
+        obs, self._sees_now = self._observer.observe()
+        return dict(zip(self.possible_agents, obs, strict=True))
+
+    def action_masks(self) -> dict[str, np.ndarray]:
+        """
+        :return: {agent: bool [num_envs, 2]}: a slot without a car may only brake
+        """
+        return dict(zip(self.possible_agents, action_masks(self.core).transpose(1, 0, 2), strict=True))
+
+    def set_arrival_rate(self, arrival_rate: float) -> None:
+        """
+        Change the traffic in all copies.
+
+        :param arrival_rate: from the next step on, in [0, 1]
+        :raises ValueError: outside of it
+        """
+        self.core.set_arrival_rate(arrival_rate)
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """
+        :return: for each copy all that decides how it goes on
+        """
+        return [self.core.get_state(copy) for copy in range(self.num_envs)]
+
+    def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
+        """
+        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+
+        :param states: what ``get_state`` returned with as many copies of the same level
+        :return: the current observations, {agent: array [num_envs, width]}
+        :raises ValueError: if the number of copies or the level differs
+        """
+        if len(states) != self.num_envs:
+            raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")
+        for copy, state in enumerate(states):
+            self.core.set_state(copy, state)
+        self._zero_episode_sums()
+        return self._observe()
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """
+        :return: a picture of each copy, uint8 [height, width, 3]
+        """
+        return [self._get_renderer().image(self.core, copy) for copy in range(self.num_envs)]
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """
+        :param mode: None: the render mode that the environment was made with
+        :return: the pictures of all copies as tiles of one, or None if the first copy is shown in a window
+        :raises ValueError: if there is no render mode
+        """
+        mode = check_render_mode(mode or self.render_mode)
+        if mode is None:
+            raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {RENDER_MODES}.")
+        if mode == "human":
+            # SB3's own window needs OpenCV
+            self._get_renderer().show(self.core, 0, fps=TrafficJunction.metadata["render_fps"])
+            return None
+        return super().render(mode)
+
+    def close(self) -> None:
+        """Close the window and the monitor files."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        super().close()
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
+    def _get_renderer(self) -> Renderer:
+        if self._renderer is None:
+            self._renderer = Renderer(self.core.layout, self.core.max_steps)
+        return self._renderer
