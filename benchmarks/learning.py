@@ -41,11 +41,8 @@ def main() -> None:
             outcome = evaluate(result.team, env, args.episodes)
             env.close()
             success = "-" if outcome.success_rate is None else f"{outcome.success_rate:.3f} ± {outcome.standard_error:.3f}"
-            print(
-                f"{algo:<10} {seed:>5} {result.team.num_timesteps:>12,}  {success:<15} {outcome.returns.mean():>7.2f} {seconds:>6.0f}"
-                f"  {result.folder}",
-                flush=True,
-            )
+            row = f"{algo:<10} {seed:>5} {result.team.num_timesteps:>12,}  {success:<15} {outcome.returns.mean():>7.2f}"
+            print(f"{row} {seconds:>6.0f}  {result.folder}", flush=True)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from sb3_belief.zoo.run_folder import TEAM
 from sb3_belief.zoo.train import TrainOptions, make_env, make_team, train
 
 # Joint steps that two cores do in less than five minutes; the YAML entry's own number takes longer and learns more
-TIMESTEPS = 50_000
+TIMESTEPS = 60_000
 EPISODES = 512
 
 ALGO, ENV_ID = "belief_ppo", "traffic-junction-medium"

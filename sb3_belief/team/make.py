@@ -1,0 +1,74 @@
+"""Make the vectorised environment of a team from an id or from one's own PettingZoo environment."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from pettingzoo import ParallelEnv
+
+from sb3_belief.team.joint_env import JointEnv
+from sb3_belief.team.parallel_vec_env import ParallelTeamVecEnv
+from sb3_belief.team.vec_env import TeamVecEnv
+
+
+def make_team_env(
+    env: str | Callable[..., ParallelEnv],
+    n_envs: int = 1,
+    seed: int | None = None,
+    vec_env: str = "dummy",
+    env_kwargs: Mapping[str, Any] | None = None,
+    wrapper: Callable[[ParallelEnv], ParallelEnv] | None = None,
+) -> TeamVecEnv:
+    """
+    Make ``n_envs`` copies of a team environment as one SB3 ``VecEnv``.
+
+    :param env: a registered id, or a callable (class or function) that returns a new PettingZoo ``ParallelEnv``
+    :param n_envs: number of copies, at least 1
+    :param seed: copy i gets ``seed + i`` at its first reset; None: unseeded (a ``Team`` with a seed seeds them)
+    :param vec_env: "dummy" steps the copies in this process (all at once where the environment has a batched class),
+        "subproc" has one worker process per copy; these start afresh, so a script needs ``if __name__ == "__main__":``
+    :param env_kwargs: keyword arguments of the environment
+    :param wrapper: applied to each copy's ``ParallelEnv`` before its agents are split
+    :return: the vectorised environment
+    :raises TypeError: if ``env`` is an environment instead of what makes one
+    :raises ValueError: for an unknown id, an unknown ``vec_env`` or ``n_envs < 1``
+    """
+    if vec_env not in ("dummy", "subproc"):
+        raise ValueError(f"vec_env must be 'dummy' or 'subproc', got {vec_env!r}.")
+    if n_envs < 1:
+        raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
+    kwargs = dict(env_kwargs or {})
+
+    team_env: TeamVecEnv | None = None
+    if isinstance(env, str):
+        # Imported when needed: environments import TeamVecEnv from this room
+        from sb3_belief.envs.registry import make_batched_env, make_parallel_env, spec
+
+        env_id = spec(env).id
+        if vec_env == "dummy" and wrapper is None:
+            team_env = make_batched_env(env_id, n_envs, **kwargs)
+
+        def make_one() -> ParallelEnv:
+            return make_parallel_env(env_id, **kwargs)
+
+    elif callable(env) and not isinstance(env, ParallelEnv):
+        make_env = env
+
+        def make_one() -> ParallelEnv:
+            return make_env(**kwargs)
+
+    else:
+        raise TypeError(
+            f"make_team_env() needs a registered id or a callable that makes a ParallelEnv, got {type(env).__name__}:"
+            " it makes n_envs separate copies, so pass the class, or a function that returns a new environment."
+        )
+
+    if team_env is None:
+
+        def make_joint() -> JointEnv:
+            parallel_env = make_one()
+            return JointEnv(parallel_env if wrapper is None else wrapper(parallel_env))
+
+        team_env = ParallelTeamVecEnv([make_joint] * n_envs, subproc=vec_env == "subproc")
+    if seed is not None:
+        team_env.seed(seed)
+    return team_env

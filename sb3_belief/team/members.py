@@ -1,0 +1,58 @@
+"""Who takes part in lockstep: the agents as the hub sees them, and the team that observes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from greenlet import greenlet
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_belief.team.streams import RandomStream
+from sb3_belief.team.vec_env import TeamObs, TeamStep
+
+# Why an agent's coroutine has switched to the hub
+ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
+
+
+@dataclass
+class Member:
+    """
+    An agent as the hub sees it.
+
+    :param learn: runs the model's ``learn()`` with the callback it is given
+    :param act: chooses actions when the agent has finished learning: (observations, episode starts, masks) -> actions
+    :param stream: what the agent draws from
+    :param callback: the user's own for this agent, if any
+    """
+
+    learn: Callable[[BaseCallback], None]
+    act: Callable[[np.ndarray, np.ndarray, np.ndarray | None], np.ndarray]
+    stream: RandomStream
+    callback: BaseCallback | None = None
+    state: str = FINISHED
+    coroutine: greenlet = field(init=False)
+
+
+class Observer(Protocol):
+    """What the team does between the agents; all of it draws from the team's own stream."""
+
+    def on_rollout_start(self) -> None:
+        """Called before the first step of a rollout."""
+
+    def on_step(self, actions: TeamObs, step: TeamStep) -> bool:
+        """
+        :param actions: of this step
+        :param step: what the joint environment returned
+        :return: whether to go on
+        """
+
+    def on_rollout_end(self) -> None:
+        """Called when all who still learn have ended a rollout since the last time, before they train on it."""
+
+    def on_round_end(self, learning: list[str]) -> None:
+        """
+        Called when rollouts have ended and those whose were have trained on them.
+
+        :param learning: who still learns
+        """

@@ -1,0 +1,269 @@
+"""The vectorised environment of a whole team: an SB3 ``VecEnv`` whose observations and actions are dictionaries by agent."""
+
+import os
+import time
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+TeamObs: TypeAlias = dict[str, np.ndarray]
+TeamStep: TypeAlias = tuple[TeamObs, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+class TeamVecEnv(VecEnv):
+    """
+    ``num_envs`` copies of an environment with one team of ``n`` agents, stepped together and reset automatically.
+
+    A subclass implements ``_reset_joint`` and ``_step_joint``; what every team environment needs besides is here: the check
+    of the actions and the monitoring (episode returns of the team and of each agent, monitor files). After every step
+    ``infos[e]`` holds plain arrays, never dictionaries by agent, because SB3's vectorisers deep-copy infos each step:
+
+    - ``agent_rewards`` float32 [n]
+    - ``visible`` bool [n, n-1]: row i says whose action of this step agent i could observe (the others in order)
+    - ``active`` bool [n]: was in play when it acted
+    - ``life_end`` bool [n]: the agent's own return ended at this step (it terminated, or its life ended)
+    - ``truncated`` bool [n]: the agent's own return was cut by a limit at this step (never together with ``life_end``)
+
+    and at the end of the team's episode also ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool,
+    ``is_success`` bool (if the environment says), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
+    and ``agent_episode_rewards`` float64 [n].
+
+    :param num_envs: number of copies
+    :param possible_agents: names of the agents; their order is the order of every array over agents
+    :param observation_spaces: space of each agent's observation (not nested: no ``Dict``, no ``Tuple``)
+    :param action_spaces: space of each agent's action (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``)
+    :param render_mode: render mode of the copies (None, "rgb_array" or "human")
+    :raises ValueError: for names or spaces that do not fit
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        possible_agents: Sequence[str],
+        observation_spaces: Mapping[str, spaces.Space],
+        action_spaces: Mapping[str, spaces.Space],
+        render_mode: str | None = None,
+    ):
+        self.possible_agents = list(possible_agents)
+        check_spaces(self.possible_agents, observation_spaces, action_spaces)
+        # VecEnv.__init__ asks for it through get_attr()
+        self.render_mode = render_mode
+        super().__init__(
+            num_envs,
+            # gymnasium may sort the keys: iterate over possible_agents, never over these
+            spaces.Dict({agent: observation_spaces[agent] for agent in self.possible_agents}),
+            spaces.Dict({agent: action_spaces[agent] for agent in self.possible_agents}),
+        )
+        self.monitor_dir: str | None = None
+        self._writers: list[ResultsWriter] = []
+        self._actions: TeamObs = {}
+        self._action_shapes = {agent: (num_envs, *(action_spaces[agent].shape or ())) for agent in self.possible_agents}
+        self._t_start = time.time()
+        self._zero_episode_sums()
+
+    # What a subclass implements
+
+    @abstractmethod
+    def _reset_joint(self) -> TeamObs:
+        """
+        Reset all copies, copy i with the seed ``self._seeds[i]`` (None: unseeded) and the options ``self._options[i]``.
+
+        :return: observations, {agent: array [num_envs, ...]}
+        """
+
+    @abstractmethod
+    def _step_joint(self, actions: TeamObs) -> TeamStep:
+        """
+        Step all copies and reset those whose team episode ended.
+
+        :param actions: {agent: array [num_envs, ...]}, checked
+        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs] and infos
+            as described for the class, less what the monitoring adds (``episode``, ``agent_episode_rewards``); the arrays are
+            new ones each time, since models keep them
+        """
+
+    def action_masks(self) -> dict[str, np.ndarray] | None:
+        """
+        :return: which actions are possible now, {agent: bool [num_envs, k]}, or None if the environment has no masks
+        """
+        return None
+
+    # The VecEnv interface
+
+    def reset(self) -> TeamObs:
+        """
+        :return: first observations of new episodes, {agent: array [num_envs, ...]}
+        """
+        if self.monitor_dir is not None and not self._writers:
+            self.start_monitor(self.monitor_dir)
+        obs = self._reset_joint()
+        # Seeds and options are only used once
+        self._reset_seeds()
+        self._reset_options()
+        self._zero_episode_sums()
+        return obs
+
+    def step_async(self, actions: TeamObs) -> None:  # type: ignore[override]
+        """
+        :param actions: {agent: array [num_envs, ...]} with an entry for every agent
+        :raises ValueError: if an agent is missing or unknown, or an array has the wrong shape
+        """
+        self._actions = self._check_actions(actions)
+
+    def step_wait(self) -> TeamStep:
+        """
+        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs], infos
+        """
+        obs, rewards, dones, infos = self._step_joint(self._actions)
+        self._monitor_step(rewards, dones, infos)
+        return obs, rewards, dones, infos
+
+    def step(self, actions: TeamObs) -> TeamStep:  # type: ignore[override]
+        """
+        :param actions: {agent: array [num_envs, ...]}
+        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs], infos
+        :raises ValueError: if an agent is missing or unknown, or an array has the wrong shape
+        """
+        self.step_async(actions)
+        return self.step_wait()
+
+    def close(self) -> None:
+        """Close the monitor files; a subclass with resources of its own closes these too."""
+        for writer in self._writers:
+            writer.close()
+        self._writers = []
+        # A reset after close() must not truncate the finished files
+        self.monitor_dir = None
+
+    # All copies live in one object unless a subclass says otherwise
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        value = getattr(self, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        if indices is not None:
+            raise ValueError(f"The copies of {type(self).__name__} share their attributes: set_attr() takes no indices.")
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        # The monitoring is built in: evaluate_policy asks before it trusts info["episode"], and may trust it
+        return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
+
+    # Monitoring
+
+    def start_monitor(self, folder: str) -> None:
+        """
+        Write from now on one row per finished episode in SB3's monitor format: ``monitor.csv`` for the team and
+        ``agents/<agent>.monitor.csv`` for each agent's own return. Existing files are overwritten.
+
+        :param folder: where the files go; it is created if need be
+        """
+        for writer in self._writers:
+            writer.close()
+        self.monitor_dir = os.fspath(folder)
+        header: dict[str, float | str] = {"t_start": self._t_start, "env_id": type(self).__name__}
+        paths = [os.path.join(self.monitor_dir, Monitor.EXT)]
+        paths += [os.path.join(self.monitor_dir, "agents", f"{agent}.{Monitor.EXT}") for agent in self.possible_agents]
+        self._writers = [ResultsWriter(path, header, extra_keys=("is_success",)) for path in paths]
+
+    def _zero_episode_sums(self) -> None:
+        self._team_returns = np.zeros(self.num_envs)
+        self._agent_returns = np.zeros((self.num_envs, len(self.possible_agents)))
+        self._lengths = np.zeros(self.num_envs, dtype=int)
+
+    def _monitor_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        self._team_returns += rewards
+        self._agent_returns += np.concatenate([info["agent_rewards"] for info in infos]).reshape(self._agent_returns.shape)
+        self._lengths += 1
+        for env_idx in np.flatnonzero(dones):
+            info = infos[env_idx]
+            seconds = round(time.time() - self._t_start, 6)
+            team_return, length = float(self._team_returns[env_idx]), int(self._lengths[env_idx])
+            info["episode"] = {"r": team_return, "l": length, "t": seconds}
+            info["agent_episode_rewards"] = self._agent_returns[env_idx].copy()
+            if self._writers:
+                # An empty cell where the environment does not tell successes
+                row = {"l": length, "t": seconds, "is_success": info.get("is_success", "")}
+                for writer, value in zip(self._writers, [team_return, *info["agent_episode_rewards"]], strict=True):
+                    writer.write_row({"r": round(float(value), 6), **row})
+            self._team_returns[env_idx] = 0.0
+            self._agent_returns[env_idx] = 0.0
+            self._lengths[env_idx] = 0
+
+    # Checks
+
+    def _check_actions(self, actions: Any) -> TeamObs:
+        if not isinstance(actions, Mapping):
+            raise ValueError(
+                f"A team's actions are a dict {{agent: array [{self.num_envs}, ...]}} with the agents"
+                f" {self.possible_agents}, not {type(actions).__name__}."
+            )
+        if actions.keys() != self._action_shapes.keys():
+            missing, unknown = _difference(self.possible_agents, actions)
+            raise ValueError(
+                f"Each agent needs an action: missing {missing}, unknown {unknown}; the agents are {self.possible_agents}."
+            )
+        checked = {agent: np.asarray(actions[agent]) for agent in self.possible_agents}
+        for agent, shape in self._action_shapes.items():
+            if checked[agent].shape != shape:
+                raise ValueError(
+                    f"The actions of {agent!r} must have the shape {shape} (one per environment copy),"
+                    f" got {checked[agent].shape}."
+                )
+        return checked
+
+
+def _difference(expected: Sequence[str], given: Iterable[str]) -> tuple[list[str], list[str]]:
+    """
+    :return: what is missing in ``given``, and what is not expected there
+    """
+    given = list(given)
+    return [name for name in expected if name not in given], [name for name in given if name not in expected]
+
+
+def check_spaces(
+    agents: Sequence[str], observation_spaces: Mapping[str, spaces.Space], action_spaces: Mapping[str, spaces.Space]
+) -> None:
+    """
+    :param agents: names of the agents
+    :param observation_spaces: of all agents
+    :param action_spaces: of all agents
+    :raises ValueError: for names or spaces that a team cannot have
+    """
+    if not agents or len(set(agents)) != len(agents):
+        raise ValueError(f"possible_agents must be one or more different names, got {agents}.")
+    for name, given in (("observation_spaces", observation_spaces), ("action_spaces", action_spaces)):
+        missing, unknown = _difference(agents, given)
+        if missing or unknown:
+            raise ValueError(f"{name} must have a space for each of {agents}: missing {missing}, unknown {unknown}.")
+    for agent in agents:
+        if isinstance(observation_spaces[agent], (spaces.Dict, spaces.Tuple)):
+            raise ValueError(
+                f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
+                " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
+            )
+        allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+        if not isinstance(action_spaces[agent], allowed):
+            raise ValueError(
+                f"The action space of {agent!r} is {action_spaces[agent]}; allowed are"
+                f" {', '.join(space.__name__ for space in allowed)}."
+            )
+        if np.any(getattr(action_spaces[agent], "start", 0)):
+            raise ValueError(
+                f"The action space of {agent!r} is {action_spaces[agent]}: SB3 numbers actions from 0, so the environment"
+                " must too (start=0)."
+            )

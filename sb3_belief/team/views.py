@@ -1,0 +1,123 @@
+"""What each agent is given of a joint step: its own observation, reward and done, and others' actions that it could see."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_belief.team.vec_env import TeamObs, TeamStep
+
+AgentStep = tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+def _component_sizes(space: spaces.Space) -> np.ndarray | None:
+    """
+    :return: number of values of each discrete component of an action, None if actions are numbers to be taken as they are
+    """
+    if isinstance(space, spaces.Discrete):
+        return np.array([space.n])
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.nvec.ravel()
+    return None
+
+
+class TeamViews:
+    """
+    Splits joint steps into the steps of the agents, for all of them at once with flat arrays.
+
+    :param possible_agents: names of the agents in order
+    :param action_spaces: their action spaces
+    """
+
+    def __init__(self, possible_agents: Sequence[str], action_spaces: dict[str, spaces.Space]):
+        self._agents = list(possible_agents)
+        n_agents = len(self._agents)
+        # All actions stand in one row of W_all columns, coded as gymnasium.spaces.flatten does it; column c is owner[c]'s
+        widths = [int(spaces.flatdim(action_spaces[agent])) for agent in self._agents]
+        starts = np.concatenate([[0], np.cumsum(widths)])
+        self._width = int(starts[-1])
+        owner = np.repeat(np.arange(n_agents), widths)
+        self._numbers: dict[str, slice] = {}
+        self._discrete: list[str] = []
+        offsets: list[np.ndarray] = []
+        for agent, start, stop in zip(self._agents, starts[:-1], starts[1:], strict=True):
+            sizes = _component_sizes(action_spaces[agent])
+            if sizes is None:
+                self._numbers[agent] = slice(start, stop)
+            else:
+                self._discrete.append(agent)
+                offsets.append(start + np.concatenate([[0], np.cumsum(sizes)[:-1]]))
+        # Where the one-hot code of each discrete component starts
+        self._offsets = np.concatenate(offsets).astype(int) if offsets else np.zeros(0, dtype=int)
+        # Agent i is given, of those columns, the others': (viewer, column) pairs of all agents one after the other
+        pairs = [(i, column) for i in range(n_agents) for column in range(self._width) if owner[column] != i]
+        viewers = np.array([i for i, _ in pairs], dtype=int)
+        self._sources = np.array([column for _, column in pairs], dtype=int)
+        # visible[i] has a column for each of the others, so the owner's number shifts by one behind the viewer itself
+        owners = owner[self._sources] if pairs else np.zeros(0, dtype=int)
+        seen_rows = owners - (owners > viewers)
+        # Places in visible[i, j], laid out flat
+        self._seen = viewers * (n_agents - 1) + seen_rows
+        bounds = np.concatenate([[0], np.cumsum([self._width - width for width in widths])])
+        self._parts = [slice(start, stop) for start, stop in pairwise(bounds)]
+
+    def split(self, actions: TeamObs, step: TeamStep) -> list[AgentStep]:
+        """
+        :param actions: {agent: array [num_envs, ...]} that led to the step
+        :param step: what ``TeamVecEnv.step`` returned for them
+        :return: for each agent observations [num_envs, ...], rewards float32 [num_envs], dones bool [num_envs] and infos
+        """
+        obs, _, team_dones, infos = step
+        n_envs, n_agents = len(infos), len(self._agents)
+        # concatenate() takes a third of the time of array()
+        rewards = np.concatenate([info["agent_rewards"] for info in infos]).astype(np.float32).reshape(n_envs, n_agents)
+        visible = np.concatenate([info["visible"] for info in infos], axis=None).reshape(n_envs, n_agents, n_agents - 1)
+        active = np.concatenate([info["active"] for info in infos]).reshape(n_envs, n_agents)
+        life_end = np.concatenate([info["life_end"] for info in infos]).reshape(n_envs, n_agents)
+        truncated = np.concatenate([info["truncated"] for info in infos]).reshape(n_envs, n_agents)
+        dones = team_dones[:, None] | life_end | truncated
+        # The value of an inactive slot is never trained, so it must not be bootstrapped from either
+        cut = truncated & ~life_end & active
+        seen_actions = self._seen_actions(actions, visible)
+        any_done = bool(dones.any())
+
+        steps: list[AgentStep] = []
+        for i, agent in enumerate(self._agents):
+            agent_infos: list[dict[str, Any]] = [
+                {"others_actions": others, "others_visible": seen, "active": is_active}
+                for others, seen, is_active in zip(
+                    seen_actions[:, self._parts[i]], visible[:, i], active[:, i].tolist(), strict=True
+                )
+            ]
+            if any_done:
+                for env_idx in np.flatnonzero(dones[:, i]):
+                    self._end(agent_infos[env_idx], i, obs[agent][env_idx], bool(cut[env_idx, i]), infos[env_idx])
+            # Copies: SB3's on-policy algorithms add the bootstrapped value to the rewards in place
+            steps.append((obs[agent], rewards[:, i].copy(), dones[:, i].copy(), agent_infos))
+        return steps
+
+    def _end(self, agent_info: dict[str, Any], i: int, obs: np.ndarray, cut: bool, info: dict[str, Any]) -> None:
+        """Add what SB3 expects at a done; an agent whose own return ends before the team's has no reset between."""
+        agent_info["terminal_observation"] = info.get("terminal_observation", {}).get(self._agents[i], obs)
+        agent_info["TimeLimit.truncated"] = cut
+        if "episode" in info:
+            agent_info["episode"] = {**info["episode"], "r": float(info["agent_episode_rewards"][i])}
+            if "is_success" in info:
+                agent_info["is_success"] = info["is_success"]
+
+    def _seen_actions(self, actions: TeamObs, visible: np.ndarray) -> np.ndarray:
+        """
+        :return: float32 [num_envs, sum over agents of W]: what each is given of the others' actions
+        """
+        n_envs = len(visible)
+        flat = np.zeros((n_envs, self._width), dtype=np.float32)
+        if self._discrete:
+            chosen = np.concatenate([actions[agent].reshape(n_envs, -1) for agent in self._discrete], axis=1)
+            flat[np.arange(n_envs)[:, None], chosen.astype(int) + self._offsets] = 1.0
+        for agent, columns in self._numbers.items():
+            flat[:, columns] = actions[agent].reshape(n_envs, -1)
+        seen = visible.reshape(n_envs, -1).take(self._seen, axis=1)
+        # where() and not a product: an invisible action that is not a number must not come through as one
+        return np.where(seen, flat.take(self._sources, axis=1), np.float32(0.0))

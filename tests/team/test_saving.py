@@ -1,0 +1,172 @@
+"""The file of a team, and the agents' own zips in it."""
+
+import io
+import json
+import subprocess
+import sys
+import zipfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import A2C, DQN, PPO
+
+from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
+from tests.team.toy_envs import MixedEnv, ToyEnv
+
+ROOT = Path(__file__).parents[2]
+
+
+def trained(n_envs=2, **kwargs):
+    team = Team(PPO, "MlpPolicy", make_team_env(ToyEnv, n_envs=n_envs), **{"seed": 0, **PPO_KWARGS, **kwargs})
+    return team.learn(32)
+
+
+def test_an_agents_zip_loads_alone_in_a_fresh_process(tmp_path):
+    team = trained()
+    team.save(tmp_path / "team.zip")
+    with zipfile.ZipFile(tmp_path / "team.zip") as archive:
+        archive.extract("agents/agent_1.zip", tmp_path)
+    obs = np.random.default_rng(0).normal(size=(20, 2)).astype(np.float32)
+    np.save(tmp_path / "obs.npy", obs)
+    # nothing of this package is imported there
+    script = """
+import sys
+import numpy as np
+import torch as th
+from stable_baselines3 import PPO
+model = PPO.load("agents/agent_1.zip", device="cpu")
+obs = np.load("obs.npy")
+with th.no_grad():
+    values = model.policy.predict_values(th.as_tensor(obs)).numpy()
+np.savez("out.npz", actions=model.predict(obs, deterministic=True)[0], values=values)
+assert not any(name.startswith("sb3_belief") for name in sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    out = np.load(tmp_path / "out.npz")
+    model = team.agents["agent_1"]
+    assert np.array_equal(out["actions"], model.predict(obs, deterministic=True)[0])
+    with th.no_grad():
+        assert np.array_equal(out["values"], model.policy.predict_values(th.as_tensor(obs)).numpy())
+
+
+@pytest.mark.parametrize("normalize", [False, {"clip_obs": 2.0}])
+def test_round_trip(tmp_path, normalize):
+    team = trained(normalize=normalize)
+    team.save(tmp_path / "deep" / "er" / "team")
+    obs = make_team_env(ToyEnv, n_envs=4, seed=8).reset()
+    for path, env in (
+        ("team", None),
+        ("team.zip", make_team_env(ToyEnv, n_envs=2)),
+        ("team", make_team_env(ToyEnv, n_envs=3)),
+    ):
+        loaded = Team.load(tmp_path / "deep" / "er" / path, env=env, device="cpu")
+        assert loaded.num_timesteps == 32 and loaded.seed == 0 and loaded.normalize == normalize
+        assert loaded.possible_agents == team.possible_agents and loaded.get_env() is env
+        for agent, model in team.agents.items():
+            assert th.equal(parameters(model), parameters(loaded.agents[agent]))
+            assert np.array_equal(
+                loaded.predict(obs, deterministic=True)[0][agent], team.predict(obs, deterministic=True)[0][agent]
+            )
+        if env is None:
+            assert loaded.observation_space == team.observation_space
+            with pytest.raises(ValueError, match="no environment to learn in"):
+                loaded.learn(8)
+            continue
+        if normalize:
+            mine, theirs = (t.agents["agent_0"].get_vec_normalize_env() for t in (loaded, team))
+            assert np.array_equal(mine.obs_rms.mean, theirs.obs_rms.mean) and mine.clip_obs == 2.0 and mine.training
+        before = parameters(loaded.agents["agent_1"])
+        loaded.learn(24, reset_num_timesteps=False)
+        assert loaded.num_timesteps >= 56 and not th.equal(before, parameters(loaded.agents["agent_1"]))
+
+
+def test_open_files_and_classes():
+    team = Team({"agent_0": A2C, "agent_1": DQN}, "MlpPolicy", make_team_env(ToyEnv), seed=0)
+    file = io.BytesIO()
+    team.save(file)
+    file.seek(0)
+    with zipfile.ZipFile(file) as archive:
+        manifest = json.loads(archive.read("team.json"))
+    assert manifest["format"] == 1 and manifest["agents"] == ["agent_0", "agent_1"]
+    assert manifest["classes"] == {"agent_0": "stable_baselines3.a2c.a2c:A2C", "agent_1": "stable_baselines3.dqn.dqn:DQN"}
+    assert manifest["versions"]["stable-baselines3"] and manifest["versions"]["sb3-belief"]
+    loaded = Team.load(file, env=make_team_env(ToyEnv))
+    assert [type(model) for model in loaded.agents.values()] == [A2C, DQN]
+    loaded.learn(20)
+
+
+def test_an_environment_that_does_not_fit(tmp_path):
+    trained().save(tmp_path / "team")
+
+    class Longer(ToyEnv):
+        def action_space(self, agent):
+            return type(super().action_space(agent))(4 if agent == "agent_1" else 3)
+
+    with pytest.raises(ValueError, match=r"agent_1: action space saved as Discrete\(3\), environment has Discrete\(4\)\.$"):
+        Team.load(tmp_path / "team", env=make_team_env(Longer))
+    with pytest.raises(ValueError, match=r"has the agents \['agent_0', 'agent_1'\], the environment has \['zeta'"):
+        Team.load(tmp_path / "team", env=make_team_env(MixedEnv))
+    with pytest.raises(TypeError, match="make_team_env"):
+        Team.load(tmp_path / "team", env=ToyEnv())
+
+
+def rewrite(path, change):
+    """Write a saved team's file anew with another manifest."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(parts["team.json"])
+    change(manifest)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, json.dumps(manifest) if name == "team.json" else part)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"format": 99}, "team format 99; this version reads 1"),
+        ({"agents": ["agent_0", "agent_1", "agent_9"]}, "damaged.*agent_9"),
+        (
+            {"classes": {"agent_0": "no.such.module:Class", "agent_1": "os:path"}},
+            "no.such.module:Class, which cannot be imported",
+        ),
+        ({"classes": {"agent_0": "os:path", "agent_1": "os:path"}}, "not an SB3 algorithm"),
+    ],
+)
+def test_manifests_that_are_wrong(tmp_path, change, says):
+    trained().save(tmp_path / "team.zip")
+    rewrite(tmp_path / "team.zip", lambda manifest: manifest.update(change))
+    with pytest.raises(ValueError, match=says):
+        Team.load(tmp_path / "team.zip")
+
+
+def test_files_that_are_no_team(tmp_path):
+    team = trained()
+    team.save(tmp_path / "team.zip")
+    whole = (tmp_path / "team.zip").read_bytes()
+    (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.zip").write_text("not a zip")
+    team.agents["agent_0"].save(tmp_path / "model.zip")
+    for name in ("half.zip", "text.zip"):
+        with pytest.raises(ValueError, match="not a saved team, or it is damaged"):
+            Team.load(tmp_path / name)
+    with pytest.raises(ValueError, match="single SB3 model"):
+        Team.load(tmp_path / "model.zip")
+    with pytest.raises(FileNotFoundError):
+        Team.load(tmp_path / "nothing")
+
+
+def test_no_environment_in_the_file(tmp_path):
+    """Neither the hub nor a callback of a user's ends up in an agent's zip."""
+    team = Team(PPO, "MlpPolicy", make_team_env(partial(ToyEnv, limit=3)), seed=0, **PPO_KWARGS)
+    team.learn(8)
+    team.save(tmp_path / "team")
+    with zipfile.ZipFile(tmp_path / "team.zip") as archive:
+        for agent in team.possible_agents:
+            with zipfile.ZipFile(io.BytesIO(archive.read(f"agents/{agent}.zip"))) as model:
+                data = model.read("data").decode()
+            assert "sb3_belief" not in data and "greenlet" not in data
+            assert "env" not in json.loads(data) and "_logger" not in json.loads(data)
