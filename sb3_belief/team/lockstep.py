@@ -83,6 +83,7 @@ class Lockstep:
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
         self._go_on = True
+        self._vote = True
         self.n_steps = 0
         self.agent_envs = {agent: AgentVecEnv(self, agent) for agent in self.possible_agents}
 
@@ -126,6 +127,8 @@ class Lockstep:
         :param go_on: what its own callbacks say
         :return: what all say
         """
+        if not self._vote:
+            return True
         self._go_on = self._go_on and bool(go_on)
         self.wait(agent, COUNTED)
         return self._go_on
@@ -172,6 +175,8 @@ class Lockstep:
         self._members = {agent: members[agent] for agent in self.possible_agents}
         self._main = getcurrent()
         self.n_steps = 0
+        # Without any callback nobody could see who has counted a step, nor stop the others: then the second stop is left out
+        self._vote = observer.has_callback or any(member.callback is not None for member in members.values())
         try:
             with StreamSwitch(stream) as streams:
                 try:
@@ -205,7 +210,7 @@ class Lockstep:
             streams.to(stream)
             actions = {agent: np.asarray(self._actions[agent]) for agent in members}
             step = self._step(actions)
-            for agent in learning:
+            for agent in learning if self._vote else ():
                 # Only the user's callbacks may draw random numbers here; without them the exchange of streams is spared
                 if members[agent].callback is not None:
                     streams.to(members[agent].stream)
@@ -215,7 +220,7 @@ class Lockstep:
             all_act = True
             for agent in learning:
                 member = members[agent]
-                if member.state == COUNTED:
+                if member.state == COUNTED or not self._vote:
                     streams.to(member.stream)
                     self._resume(agent)
                 all_act = all_act and member.state == ACTS

@@ -35,7 +35,13 @@ class Member:
 
 
 class Observer(Protocol):
-    """What the team does between the agents; all of it draws from the team's own stream."""
+    """
+    What the team does between the agents; all of it draws from the team's own stream.
+
+    :param has_callback: whether ``on_step`` looks at the agents, or can say no
+    """
+
+    has_callback: bool
 
     def on_rollout_start(self) -> None:
         """Called before the first step of a rollout."""

@@ -36,8 +36,7 @@ class TeamProgress:
 
     def __init__(self, team: "Team", callback: BaseCallback, log: TeamLog):
         self._team, self._callback, self._log = team, callback, log
-        # Nothing to do for it at each step
-        self._idle = isinstance(callback, ConvertCallback) and callback.callback is None
+        self.has_callback = not (isinstance(callback, ConvertCallback) and callback.callback is None)
         callback.init_callback(team)  # type: ignore[arg-type]
 
     def on_training_start(self, locals_: dict[str, Any]) -> None:
@@ -53,7 +52,7 @@ class TeamProgress:
         obs, rewards, dones, infos = step
         self._team.num_timesteps += len(dones)
         go_on = True
-        if not self._idle:
+        if self.has_callback:
             locals_ = {"actions": actions, "new_obs": obs, "rewards": rewards, "dones": dones, "infos": infos}
             self._callback.update_locals(locals_)
             go_on = self._callback.on_step()

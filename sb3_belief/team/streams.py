@@ -1,35 +1,16 @@
 """Random streams: every agent draws from generators of its own, although SB3 draws from the global ones."""
 
-import _random
-import ctypes
 import random
-import sys
 
 import numpy as np
 import torch as th
 from numpy.random import mtrand
 
-# Python's generator has no quick way to ask whether it was used: getstate() alone would be most of an exchange's time. Its
-# memory as a whole tells it, at worst by a false alarm.
-_CAN_LOOK = sys.implementation.name == "cpython"
-_PYTHON_RANDOM = getattr(random.random, "__self__", None)
-
-
-def _look() -> tuple[bytes, float | None] | None:
-    """
-    :return: what differs if Python's global generator was used in between; None if this cannot be told
-    """
-    if not _CAN_LOOK or not isinstance(_PYTHON_RANDOM, random.Random):
-        return None
-    # gauss() keeps a number back outside of that memory
-    memory = ctypes.string_at(id(_PYTHON_RANDOM), _random.Random.__basicsize__)
-    return memory, _PYTHON_RANDOM.gauss_next  # type: ignore[attr-defined]
-
 
 class RandomStream:
     """
-    What one party draws from: a state of each of the global generators (torch's on the CPU and on every CUDA device in use,
-    numpy's, Python's). Only one stream is the current one; ``suspend`` and ``resume`` exchange them.
+    What one party draws from: a state of each of the global generators that SB3 draws from (torch's on the CPU and on every
+    CUDA device in use, numpy's). Only one stream is the current one; ``suspend`` and ``resume`` exchange them.
 
     numpy's global generator is exchanged as an object, since reading its state takes about 100 times as long. The only thing
     lost by that is the second normal number that ``np.random.normal`` keeps back: it is drawn anew after an exchange.
@@ -43,26 +24,21 @@ class RandomStream:
         self._numpy = np.random.MT19937()
         # As np.random.seed() does it: a model that seeds itself and one that does not draw the same numbers for the same seed
         self._numpy._legacy_seeding(seed)
-        self._python = random.Random(seed).getstate()
         self._torch = th.Generator().manual_seed(seed).get_state()
-        self._python_look: tuple[bytes, float | None] | None = None
+        #: For ``StreamSwitch``: what Python's generator starts from where this stream is the first
+        self.python = random.Random(seed).getstate()
         self._cuda: list[th.Tensor] = []
 
     def resume(self) -> None:
         """Make this the current stream."""
         th.default_generator.set_state(self._torch)
         mtrand.set_bit_generator(self._numpy)
-        random.setstate(self._python)
-        self._python_look = _look()
         if self._cuda:
             th.cuda.set_rng_state_all(self._cuda)
 
     def suspend(self) -> None:
         """Note how far this stream, the current one, has come."""
         self._torch = th.default_generator.get_state()
-        look = _look()
-        if look is None or look != self._python_look:
-            self._python = random.getstate()
         if th.cuda.is_initialized():
             self._cuda = th.cuda.get_rng_state_all()
 
@@ -70,6 +46,9 @@ class RandomStream:
 class StreamSwitch:
     """
     Lends the global generators to one stream after another, as a context manager that puts the caller's own state back.
+
+    Python's generator, whose state is slow to exchange and which no algorithm of SB3 draws from, is lent once, to the first
+    stream: environments and callbacks of a team share it.
 
     :param stream: who draws at the beginning
     """
@@ -82,14 +61,18 @@ class StreamSwitch:
         # The caller may hold back a normal number in numpy's generator, so its state is read in full
         self._callers = RandomStream(0)
         self._callers.suspend()
+        self._callers_python = random.getstate()
         self._callers_numpy = mtrand.get_bit_generator(), np.random.get_state(legacy=False)
         self._current = self._first
         self._current.resume()
+        random.setstate(self._first.python)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._current.suspend()
+        self._first.python = random.getstate()
         self._callers.resume()
+        random.setstate(self._callers_python)
         bit_generator, state = self._callers_numpy
         mtrand.set_bit_generator(bit_generator)
         np.random.set_state(state)

@@ -58,6 +58,8 @@ def enjoy(options: EnjoyOptions) -> Outcome:
     env = _make_env(config, options)
     try:
         team = Team.load(path, env=env, device=options.device)
+        # After loading, which seeds the environment as it was seeded for the training
+        env.seed(options.seed)
         frames: list[np.ndarray] | None = None if options.output is None else []
         outcome = _play(team, env, options, frames)
         if options.output is not None and frames:

@@ -160,7 +160,7 @@ def make_team(
     )
     try:
         if trained is not None:
-            return _load_team(config, trained, env, common)
+            return _load_team(config, trained, env, seed, common)
         return Team(
             config.algo_class, config.policy, env, seed=seed, normalize=config.normalize, **common, **config.algo_kwargs
         )
@@ -169,11 +169,13 @@ def make_team(
         raise ConfigError(f"{config.source}: {config.algo} cannot be set up on {config.env_id}: {error}") from error
 
 
-def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, common: dict[str, Any]) -> Team:
+def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, common: dict[str, Any]) -> Team:
     team = Team.load(trained, env=env, **common)
     for agent, model in team.agents.items():
         if type(model) is not config.algo_class:
             raise ValueError(f"{agent!r} in {str(trained)!r} is a {type(model).__name__}, not a {config.algo_class.__name__}")
+    # Loading seeds the environment as in the run before: going on is not to meet the same episodes again
+    env.seed(seed)
     return team
 
 

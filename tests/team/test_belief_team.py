@@ -16,7 +16,9 @@ def make_team(belief="dynamic", seed=0, **env_kwargs):
 
 def parameters(team):
     return {
-        f"{agent}.{name}": value.clone() for agent, model in team.agents.items() for name, value in model.policy.state_dict().items()
+        f"{agent}.{name}": value.clone()
+        for agent, model in team.agents.items()
+        for name, value in model.policy.state_dict().items()
     }
 
 

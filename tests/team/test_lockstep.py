@@ -168,6 +168,18 @@ def test_order_of_callbacks_and_counts():
     assert team.num_timesteps == 32
 
 
+@pytest.mark.parametrize("algo, kwargs", [(PPO, PPO_KWARGS), (DQN, {"learning_starts": 10})])
+def test_callbacks_do_not_change_what_is_learned(algo, kwargs):
+    """Without any callback the agents take a shorter way through a step."""
+    runs = []
+    for team_callback, own in ((None, {}), (Record(), {}), (None, {"agent_1": Record()}), (Record(), {"agent_0": Record()})):
+        team = Team(algo, "MlpPolicy", make_team_env(ToyEnv, n_envs=2), seed=0, **kwargs)
+        team.learn(48, callback=team_callback, agent_callbacks=own)
+        assert team.num_timesteps == 48
+        runs.append([parameters(model) for model in team.agents.values()])
+    assert all(th.equal(a, b) for run in runs[1:] for a, b in zip(run, runs[0], strict=True))
+
+
 def test_unequal_rollouts():
     """Who has finished learning goes on acting, without learning, until the last one has finished."""
     env = make_team_env(ToyEnv)

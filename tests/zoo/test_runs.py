@@ -225,6 +225,37 @@ def test_enjoy_writes_an_episode(ending, manner, run, tmp_path, capsys):
     assert "Mean return over 2 episodes: 0.000" in said and "Success rate: 1.000" in said
 
 
+def test_enjoy_plays_other_episodes_with_another_seed(run, tmp_path):
+    seeds = {"a": "1", "b": "2", "c": "1"}
+    for name, seed in seeds.items():
+        assert main(["enjoy", str(run), "--output", str(tmp_path / f"{name}.gif"), "--seed", seed]) == 0
+    first, second, again = (tmp_path.joinpath(f"{name}.gif").read_bytes() for name in seeds)
+    assert first == again and first != second
+
+
+def test_going_on_meets_other_episodes(run, tmp_path):
+    for seed in ("1", "2"):
+        words = [
+            "train",
+            "-i",
+            str(run),
+            "-n",
+            "80",
+            "--seed",
+            seed,
+            "-f",
+            str(tmp_path / seed),
+            "--eval-freq",
+            "-1",
+            "--verbose",
+            "0",
+        ]
+        assert main(words) == 0
+    first, second = (next(tmp_path.glob(f"{seed}/*/*/monitor.csv")).read_text().splitlines() for seed in ("1", "2"))
+    # the same team, so only the traffic can differ; the last columns are a clock and the success
+    assert [row.split(",")[0] for row in first[2:]] != [row.split(",")[0] for row in second[2:]]
+
+
 def test_enjoy_counts_steps_if_asked(run, tmp_path, capsys):
     assert main(["enjoy", str(run / "best_model.zip"), "--output", str(tmp_path / "a.gif"), "-n", "5"]) == 0
     assert "Wrote 5 frames" in capsys.readouterr().out
