@@ -1,8 +1,12 @@
 """
 What lockstep costs: a team of three stock PPOs against the same three trained by a hand-written loop.
 
-Both train on mpe2's simple_spread (8 copies x 128 steps per iteration, 10 epochs, 4 minibatches, 64x64 tanh, one thread), in
-turn within one run, and count joint steps (of one copy) per second of CPU time of this process.
+All train on mpe2's simple_spread (8 copies x 128 steps per iteration, 10 epochs, 4 minibatches, 64x64 tanh, one thread), in
+turn within one run, and count joint steps (of one copy) per second of CPU time of this process. Two loops are compared with:
+
+- ``by hand``: over the same vectorised environment as the team's; what lockstep and SB3's own rollout cost
+- ``bare``: over eight bare environments of just this kind (all agents always in play, one action type, every end a time limit,
+  no visibility, no infos); what a team costs altogether against a program for one environment only
 """
 
 import argparse
@@ -18,6 +22,8 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_belief.team import Team, make_team_env
 from sb3_belief.team.lockstep import Lockstep
+
+Advance = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, dict[int, dict[str, np.ndarray]]]
 
 N_ENVS, N_STEPS = 8, 128
 SETTINGS = dict(n_steps=N_STEPS, batch_size=N_ENVS * N_STEPS // 4, n_epochs=10, device="cpu")
@@ -35,72 +41,93 @@ class ByTeam:
 
 
 class ByHand:
-    """The same three PPOs' policies, buffers and ``train()``, with the loop over steps written out for this environment."""
+    """The same three PPOs' policies, buffers and ``train()``, with the loop over steps written out."""
 
     def __init__(self) -> None:
-        self.envs = [simple_spread_v3.parallel_env() for _ in range(N_ENVS)]
-        self.agents = self.envs[0].possible_agents
-        self.models = {}
+        self.env = make_team_env(simple_spread_v3.parallel_env, n_envs=N_ENVS, seed=0)
+        self.agents = self.env.possible_agents
         # Only for the models' spaces; it is never stepped
         hub = Lockstep(make_team_env(simple_spread_v3.parallel_env, n_envs=N_ENVS))
+        self.models = {}
         for k, agent in enumerate(self.agents):
             model = PPO("MlpPolicy", hub.agent_envs[agent], seed=k, **SETTINGS)  # type: ignore[arg-type]
             model.set_logger(Logger(None, []))
             self.models[agent] = model
-        observations = [env.reset(seed=i)[0] for i, env in enumerate(self.envs)]
-        self.obs = {agent: np.stack([obs[agent] for obs in observations]) for agent in self.agents}
+        self.obs = self._reset()
         self.starts = np.ones(N_ENVS, dtype=bool)
-        self.episodes: dict[str, deque] = {agent: deque(maxlen=100) for agent in self.agents}
-        self.returns = np.zeros((N_ENVS, len(self.agents)))
 
     def iterate(self, iterations: int) -> None:
         for _ in range(iterations):
-            self._rollout()
             for model in self.models.values():
+                model.policy.set_training_mode(False)
+                model.rollout_buffer.reset()
+            for _ in range(N_STEPS):
+                self._step()
+            for agent, model in self.models.items():
+                with th.no_grad():
+                    values = model.policy.predict_values(th.as_tensor(self.obs[agent]))
+                model.rollout_buffer.compute_returns_and_advantage(values, self.starts)
                 model.logger.dump()
                 model.train()
 
-    def _rollout(self) -> None:
-        for model in self.models.values():
-            model.policy.set_training_mode(False)
-            model.rollout_buffer.reset()
-        for _ in range(N_STEPS):
-            self._step()
-        with th.no_grad():
-            for agent, model in self.models.items():
-                values = model.policy.predict_values(th.as_tensor(self.obs[agent]))
-                model.rollout_buffer.compute_returns_and_advantage(values, self.starts)
-
     def _step(self) -> None:
-        outputs = {}
+        outputs, actions = {}, {}
         with th.no_grad():
             for agent, model in self.models.items():
-                actions, values, log_probs = model.policy(th.as_tensor(self.obs[agent]))
-                outputs[agent] = actions.numpy(), values, log_probs
+                outputs[agent] = model.policy(th.as_tensor(self.obs[agent]))
+                actions[agent] = outputs[agent][0].numpy()
+        next_obs, rewards, dones, terminal_obs = self._advance(actions)
+        for i in np.flatnonzero(dones).tolist():
+            for k, (agent, model) in enumerate(self.models.items()):
+                with th.no_grad():
+                    value = model.policy.predict_values(th.as_tensor(terminal_obs[i][agent][None]))
+                rewards[i, k] += model.gamma * float(value)
+        for k, (agent, model) in enumerate(self.models.items()):
+            _, values, log_probs = outputs[agent]
+            chosen = actions[agent].reshape(-1, 1)
+            model.rollout_buffer.add(self.obs[agent], chosen, rewards[:, k], self.starts, values, log_probs)
+            model.num_timesteps += N_ENVS
+        self.obs, self.starts = next_obs, dones
+
+    def _reset(self) -> dict[str, np.ndarray]:
+        return self.env.reset()
+
+    def _advance(self, actions: dict[str, np.ndarray]) -> Advance:
+        """
+        :return: next observations, rewards [n_envs, n], dones [n_envs] and of ended copies the last observations
+        """
+        obs, _, dones, infos = self.env.step(actions)
+        rewards = np.array([info["agent_rewards"] for info in infos])
+        return obs, rewards, dones, {i: infos[i]["terminal_observation"] for i in np.flatnonzero(dones).tolist()}
+
+
+class Bare(ByHand):
+    """The same loop over bare environments."""
+
+    def _reset(self) -> dict[str, np.ndarray]:
+        self.envs = [simple_spread_v3.parallel_env() for _ in range(N_ENVS)]
+        self.episodes: deque = deque(maxlen=100)
+        self.returns = np.zeros((N_ENVS, len(self.agents)))
+        observations = [env.reset(seed=i)[0] for i, env in enumerate(self.envs)]
+        return {agent: np.stack([obs[agent] for obs in observations]) for agent in self.agents}
+
+    def _advance(self, actions: dict[str, np.ndarray]) -> Advance:
         next_obs = {agent: np.empty_like(obs) for agent, obs in self.obs.items()}
         rewards = np.zeros((N_ENVS, len(self.agents)), dtype=np.float32)
         dones = np.zeros(N_ENVS, dtype=bool)
+        terminal_obs = {}
         for i, env in enumerate(self.envs):
-            obs, reward, _, _, _ = env.step({agent: int(outputs[agent][0][i]) for agent in self.agents})
+            obs, reward, _, _, _ = env.step({agent: int(actions[agent][i]) for agent in self.agents})
             rewards[i] = [reward[agent] for agent in self.agents]
             self.returns[i] += rewards[i]
             if not env.agents:
-                # Every end of this environment is a time limit
-                dones[i] = True
-                with th.no_grad():
-                    for k, (agent, model) in enumerate(self.models.items()):
-                        value = model.policy.predict_values(th.as_tensor(obs[agent][None]))
-                        rewards[i, k] += model.gamma * float(value)
-                        self.episodes[agent].append(self.returns[i, k])
+                dones[i], terminal_obs[i] = True, obs
+                self.episodes.append(self.returns[i].copy())
                 self.returns[i] = 0.0
                 obs, _ = env.reset()
             for agent in self.agents:
                 next_obs[agent][i] = obs[agent]
-        for k, (agent, model) in enumerate(self.models.items()):
-            actions, values, log_probs = outputs[agent]
-            model.rollout_buffer.add(self.obs[agent], actions.reshape(-1, 1), rewards[:, k], self.starts, values, log_probs)
-            model.num_timesteps += N_ENVS
-        self.obs, self.starts = next_obs, dones
+        return next_obs, rewards, dones, terminal_obs
 
 
 def main() -> None:
@@ -111,7 +138,7 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
 
-    loops: dict[str, ByTeam | ByHand] = {"team": ByTeam(), "by hand": ByHand()}
+    loops: dict[str, ByTeam | ByHand] = {"team": ByTeam(), "by hand": ByHand(), "bare": Bare()}
     speeds: dict[str, list[float]] = {name: [] for name in loops}
     for loop in loops.values():
         loop.iterate(1)
@@ -123,7 +150,8 @@ def main() -> None:
     medians = {name: statistics.median(values) for name, values in speeds.items()}
     for name, values in speeds.items():
         print(f"{name:8s} {medians[name]:7.1f} joint steps per CPU second (from {min(values):.1f} to {max(values):.1f})")
-    print(f"ratio    {medians['team'] / medians['by hand']:7.3f}")
+    for name in ("by hand", "bare"):
+        print(f"team / {name:8s} {medians['team'] / medians[name]:.3f}")
 
 
 if __name__ == "__main__":
