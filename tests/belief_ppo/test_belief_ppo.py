@@ -4,6 +4,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from sb3_belief.belief_ppo.auxiliary import add_loss
 from sb3_belief.belief_ppo.others import action_layout, read_others
 from tests.belief_ppo.toy_envs import AmongOthers
 
-SMALL = dict(n_steps=14, batch_size=14, n_epochs=2, seed=0, history_length=40, keep_ratio=0.1)
+SMALL: dict[str, Any] = dict(n_steps=14, batch_size=14, n_epochs=2, seed=0, history_length=40, keep_ratio=0.1)
 
 
 def make_model(n_envs=3, env_kwargs=None, **kwargs):
@@ -41,7 +42,7 @@ def same_parameters(a, b):
 @pytest.mark.parametrize("belief", ["none", "dynamic"])
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_without_belief_or_others_it_is_ppo(belief, env_id):
-    kwargs = dict(n_steps=64, batch_size=32, n_epochs=3, seed=3)
+    kwargs: dict[str, Any] = dict(n_steps=64, batch_size=32, n_epochs=3, seed=3)
     ppo = PPO("MlpPolicy", env_id, **kwargs).learn(3 * 64)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -89,25 +90,26 @@ class Watch(BaseCallback):
 @pytest.mark.parametrize("inactive", [0, 3])
 def test_first_log_ratio_is_zero(inactive):
     model = make_model(env_kwargs=dict(inactive=inactive), learning_rate=1e-2)
-    ratios, evaluate, get = [], model.policy.evaluate_actions, model.rollout_buffer.get
+    ratios: list[tuple[int, int, float]] = []
+    evaluate, get = model.policy.evaluate_actions, model.rollout_buffer.get
+    at_hand: list[Any] = []
 
     def recorded_get(batch_size):
         for index, samples in enumerate(get(batch_size)):
-            ratios.append((model._n_updates, index, samples.old_log_prob))
+            at_hand[:] = [model._n_updates, index, samples.old_log_prob]
             yield samples
 
     def recorded_evaluate(obs, actions):
         values, log_prob, entropy = evaluate(obs, actions)
-        if isinstance(ratios[-1], tuple) and log_prob.requires_grad:
-            n_updates, index, old = ratios[-1]
-            ratios[-1] = [n_updates, index, float((log_prob.detach() - old).abs().max())]
+        if log_prob.requires_grad:  # not the diagnostics before the update
+            n_updates, index, old = at_hand
+            ratios.append((n_updates, index, float((log_prob.detach() - old).abs().max())))
         return values, log_prob, entropy
 
-    ratios.append(None)
     model.rollout_buffer.get, model.policy.evaluate_actions = recorded_get, recorded_evaluate
     model.learn(4 * 42, callback=Watch(lambda model: None))
-    first = [ratio for n_updates, index, ratio in ratios[1:] if n_updates % 2 == 0 and index == 0]
-    later = [ratio for n_updates, index, ratio in ratios[1:] if n_updates % 2 == 1]
+    first = [ratio for n_updates, index, ratio in ratios if n_updates % 2 == 0 and index == 0]
+    later = [ratio for n_updates, index, ratio in ratios if n_updates % 2 == 1]
     assert len(first) == 4 and max(first) < 1e-5
     assert min(later) > 1e-4  # the policy does move, so the zeros above say something
 
@@ -156,6 +158,7 @@ def test_add_loss_has_weight_one_whatever_the_value_coefficient(vf_coef):
     values = add_loss(a * th.ones(4), b**2)
     (vf_coef * values.square().mean()).backward()
     assert values.tolist() == [2.0] * 4
+    assert a.grad is not None and b.grad is not None
     assert a.grad.item() == pytest.approx(vf_coef * 4.0) and b.grad.item() == pytest.approx(6.0)
 
 
@@ -199,7 +202,12 @@ def test_history_is_frozen_during_the_update():
     model.learn(42)
     before, seen = [part.clone() for part in model.policy.history], []
     update = model._update
-    model._update = lambda: (update(), seen.append([part.clone() for part in model.policy.history]))
+
+    def watched_update():
+        update()
+        seen.append([part.clone() for part in model.policy.history])
+
+    model._update = watched_update
     model.learn(42)
     assert len(seen) == 1 and all(th.equal(a, b) for a, b in zip(before, seen[0], strict=True))
     assert not th.equal(model.policy.history.observations, before[0])
@@ -211,7 +219,8 @@ def test_nothing_of_an_invisible_other_reaches_the_agent():
     assert hidden[0] != hidden[1]
     assert same_parameters(*models)
     for name in ("others_actions", "others_visible", "noise", "kept", "advantages", "log_probs"):
-        assert np.array_equal(*(getattr(model.rollout_buffer, name) for model in models)), name
+        first, second = (getattr(model.rollout_buffer, name) for model in models)
+        assert np.array_equal(first, second), name
     for a, b in zip(models[0].policy.optimizer.state.values(), models[1].policy.optimizer.state.values(), strict=True):
         assert th.equal(a["exp_avg"], b["exp_avg"])
 
@@ -237,7 +246,8 @@ def test_inactive_steps_train_nothing(belief):
     for garbage in (-1.0, 1.0):
         env = make_vec_env(Unplayed, n_envs=2, seed=0, env_kwargs=dict(garbage=garbage))
         models.append(BeliefPPO("BeliefPolicy", env, belief=belief, **SMALL).learn(4 * 28))
-    assert not np.array_equal(*(model.rollout_buffer.observations for model in models))
+    first, second = (model.rollout_buffer.observations for model in models)
+    assert not np.array_equal(first, second)
     assert same_parameters(*models)
     rows = sum(len(samples.actions) for samples in models[0].rollout_buffer.get(16))
     assert rows == models[0].rollout_buffer.active.sum() < 28
@@ -247,8 +257,8 @@ def test_advantages_pass_through_inactive_steps():
     buffer = BeliefRolloutBuffer(4, spaces.Box(-1, 1, (1,)), spaces.Discrete(2), gamma=0.9, gae_lambda=0.8, n_envs=1)
     for step, (reward, value, active) in enumerate([(1, 5, True), (2, 100, False), (3, 100, False), (4, 7, True)]):
         buffer.stage(np.array([active]))
-        value = th.tensor([float(value)])
-        buffer.add(np.zeros((1, 1)), np.zeros((1, 1)), np.array([reward]), np.array([step == 0]), value, value)
+        estimate = th.tensor([float(value)])
+        buffer.add(np.zeros((1, 1)), np.zeros((1, 1)), np.array([reward]), np.array([step == 0]), estimate, estimate)
     buffer.compute_returns_and_advantage(th.tensor([[10.0]]), np.array([False]))
     last = 4 + 0.9 * 10 - 7
     # Out of play, nothing is estimated: from the first step on it earns 1, 2, 3, and then what the last step is worth
@@ -334,19 +344,21 @@ def test_load_goes_on_learning_with_its_history(tmp_path):
     model = make_model().learn(42)
     model.save(tmp_path / "agent")
     loaded = BeliefPPO.load(tmp_path / "agent", env=model.env)
-    assert same_parameters(model, loaded) and loaded.policy.history.valid.sum() == 40
+    assert same_parameters(model, loaded)
+    assert loaded.policy.history is not None and loaded.policy.history.valid.sum() == 40
     assert loaded.policy_kwargs == {} and loaded.rollout_buffer_class is None
     loaded.learn(42)
     model.policy.save(tmp_path / "policy")
     policy = BeliefActorCriticPolicy.load(tmp_path / "policy")
     obs = model.observation_space.sample()
     assert policy.predict(obs, deterministic=True)[0] == model.policy.predict(obs, deterministic=True)[0]
+    assert policy.history is not None
     assert th.equal(policy.history.observations, model.policy.history.observations)
 
 
 # -- spaces ------------------------------------------------------------------------------------------------------------
 
-OTHERS = {
+OTHERS: dict[str, dict[str, spaces.Space]] = {
     "one": {"b": spaces.Discrete(2)},
     "box": {"b": spaces.Box(-1, 1, (3,), np.float32), "c": spaces.Discrete(3)},
     "multi": {"b": spaces.MultiDiscrete([2, 3]), "c": spaces.MultiBinary(2)},
@@ -416,7 +428,7 @@ def test_foreign_policy_and_buffer_are_refused():
         make_model(rollout_buffer_class=RolloutBuffer)
     env = make_vec_env(AmongOthers, n_envs=1)
     with pytest.raises(TypeError, match="BeliefActorCriticPolicy"):
-        BeliefPPO(ActorCriticPolicy, env, **SMALL)
+        BeliefPPO(ActorCriticPolicy, env, **SMALL)  # type: ignore[arg-type]
 
 
 def test_another_set_of_others_is_refused(tmp_path):

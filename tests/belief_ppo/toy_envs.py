@@ -36,8 +36,8 @@ class AmongOthers(gym.Env):
         visible = self.np_random.random(len(self.others_action_spaces)) < 0.6
         parts = []
         for index, space in enumerate(self.others_action_spaces.values()):
-            shown = spaces.flatten(space, space_sample(space, self.np_random)).astype(np.float32)
-            hidden = spaces.flatten(space, space_sample(space, self.invisible)).astype(np.float32)
+            shown = np.asarray(spaces.flatten(space, space_sample(space, self.np_random)), dtype=np.float32)
+            hidden = np.asarray(spaces.flatten(space, space_sample(space, self.invisible)), dtype=np.float32)
             parts.append(shown if visible[index] else hidden)
         active = not (self.inactive and self.steps % self.inactive == 0)
         return {"others_actions": np.concatenate(parts), "others_visible": visible, "active": active}

@@ -1,12 +1,14 @@
 """A team of BeliefPPO agents at the junction: what the rooms promise holds for them together."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
 
 from sb3_belief import BeliefPPO, Team, make_team_env
 
-SMALL = dict(n_steps=20, batch_size=80, n_epochs=2, history_length=60, keep_ratio=0.1)
+SMALL: dict[str, Any] = dict(n_steps=20, batch_size=80, n_epochs=2, history_length=60, keep_ratio=0.1)
 
 
 def make_team(belief="dynamic", seed=0, **env_kwargs):
