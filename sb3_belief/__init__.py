@@ -4,9 +4,7 @@ from pathlib import Path
 
 from sb3_belief import envs
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO
-from sb3_belief.team.make import make_team_env
-from sb3_belief.team.team import Team
-from sb3_belief.team.vec_env import TeamVecEnv
+from sb3_belief.team import Team, TeamVecEnv, make_team_env
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
