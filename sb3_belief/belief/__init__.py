@@ -3,7 +3,7 @@
 from sb3_belief.belief.history import History, append_rows, empty_history
 from sb3_belief.belief.layout import ActionLayout
 from sb3_belief.belief.loss import action_loss, kl_divergence
-from sb3_belief.belief.network import BeliefOutput, DynamicBelief, HistoryContext
+from sb3_belief.belief.network import BeliefOutput, DynamicBelief, HistoryContext, n_kept
 
 __all__ = [
     "ActionLayout",
@@ -15,4 +15,5 @@ __all__ = [
     "append_rows",
     "empty_history",
     "kl_divergence",
+    "n_kept",
 ]

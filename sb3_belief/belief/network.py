@@ -53,6 +53,15 @@ class HistoryContext(NamedTuple):
     values: th.Tensor
 
 
+def n_kept(keep_ratio: float, n_rows: int) -> int:
+    """
+    :param keep_ratio: ``p``, in (0, 1]
+    :param n_rows: Number of filled history rows, at least 0
+    :return: How many of them are attended to, ``N_h`` of eq. 3: a share of ``keep_ratio``, at least one
+    """
+    return min(n_rows, max(1, round(keep_ratio * n_rows)))
+
+
 class DynamicBelief(nn.Module):
     """
     What the agent believes the others will do now, inferred from its observation and its history.
@@ -87,13 +96,6 @@ class DynamicBelief(nn.Module):
         self.value = nn.Linear(embedding_dim, embedding_dim, bias=False)
         self.encoder = nn.Linear(embedding_dim, 2 * latent_dim)
         self.decoder = nn.Linear(latent_dim, action_dim)
-
-    def n_kept(self, n_rows: int) -> int:
-        """
-        :param n_rows: Number of filled history rows, at least 0
-        :return: How many of them are attended to, ``N_h`` of eq. 3: a share of ``keep_ratio``, at least one
-        """
-        return min(n_rows, max(1, round(self.keep_ratio * n_rows)))
 
     def encode_history(self, history: History) -> HistoryContext:
         """
@@ -140,7 +142,7 @@ class DynamicBelief(nn.Module):
         is discrete, so no gradient flows through it.
         """
         similarity = F.normalize(embedding, dim=1) @ context.directions.T
-        return similarity.topk(self.n_kept(similarity.shape[1]), dim=1, sorted=False).indices
+        return similarity.topk(n_kept(self.keep_ratio, similarity.shape[1]), dim=1, sorted=False).indices
 
     def _attend(self, embedding: th.Tensor, context: HistoryContext, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

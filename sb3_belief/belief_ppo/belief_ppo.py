@@ -14,10 +14,11 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_belief.belief import n_kept
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefDictRolloutBuffer, BeliefMinibatch, BeliefRolloutBuffer
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of, read_others
-from sb3_belief.belief_ppo.policies import BeliefActorCriticPolicy, BeliefPolicyMixin, check_belief
+from sb3_belief.belief_ppo.policies import LATENT_DIM, BeliefActorCriticPolicy, BeliefPolicyMixin, check_belief
 
 if TYPE_CHECKING:
     _Algorithm = PPO
@@ -101,8 +102,8 @@ class BeliefAlgorithmMixin(_Algorithm):
         if self.belief == "none" or layout.n_others == 0:
             return {}
         return dict(
-            latent_dim=self.policy_kwargs.get("latent_dim", 64),
-            history_kept=max(1, round(self.keep_ratio * self.history_length)),
+            latent_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM),
+            history_kept=n_kept(self.keep_ratio, self.history_length),
             others_width=layout.width,
             n_others=layout.n_others,
         )

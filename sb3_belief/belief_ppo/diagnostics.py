@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_belief.belief import ActionLayout, BeliefOutput, action_loss, kl_divergence
+from sb3_belief.belief import ActionLayout, BeliefOutput, kl_divergence
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefFusion
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
@@ -43,13 +43,8 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     assert policy.belief is not None and policy.history is not None
     history = policy.history
     output = policy.belief(flat, history, minibatch.noise, minibatch.kept)
-    owners = th.as_tensor(policy.layout.owners, device=flat.device)
-
-    def loss(prediction: th.Tensor) -> float:
-        return float(action_loss(prediction, minibatch.others_actions, minibatch.others_visible, owners))
-
     measured = dict(
-        action_loss=loss(output.prediction),
+        action_loss=float(policy.action_error(output.prediction, minibatch)),
         kl=float(kl_divergence(output.mean, output.log_std)),
         visible_fraction=float(minibatch.others_visible.float().mean()),
         attention_entropy=float(-(output.weights * output.weights.clamp(min=1e-12).log()).sum(dim=1).mean()),
@@ -59,7 +54,8 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     if history.valid.any():
         with_shuffled = history._replace(actions=_shuffled(history.actions, history.valid))
         shuffled = policy.belief(flat, with_shuffled, minibatch.noise, minibatch.kept)
-        measured["history_gain"] = loss(shuffled.prediction) - measured["action_loss"]
+        loss = float(policy.action_error(shuffled.prediction, minibatch))
+        measured["history_gain"] = loss - measured["action_loss"]
     if isinstance(policy.mlp_extractor, BeliefFusion):
         measured["fusion_ratio"] = policy.mlp_extractor.belief_share()
     accuracy, base_rate = _accuracies(output, minibatch, policy.layout)

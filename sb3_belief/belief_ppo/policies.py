@@ -18,6 +18,8 @@ from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flatt
 from sb3_belief.belief_ppo.others import action_layout
 
 BELIEFS = ("dynamic", "none")
+#: The default of ``latent_dim``
+LATENT_DIM = 64
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
@@ -50,7 +52,7 @@ class BeliefPolicyMixin(_Policy):
         keep_ratio: float = 0.05,
         detach_belief: bool = False,
         embedding_dim: int = 64,
-        latent_dim: int = 64,
+        latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
         **kwargs: Any,
     ) -> None:
@@ -208,9 +210,17 @@ class BeliefPolicyMixin(_Policy):
         """
         output = self._extractor.output
         assert output is not None
-        owners = th.as_tensor(self.layout.owners, device=output.prediction.device)
-        error = action_loss(output.prediction, minibatch.others_actions, minibatch.others_visible, owners)
+        error = self.action_error(output.prediction, minibatch)
         return self.action_coef * error + self.kl_coef * kl_divergence(output.mean, output.log_std)
+
+    def action_error(self, prediction: th.Tensor, minibatch: BeliefMinibatch) -> th.Tensor:
+        """
+        :param prediction: Predicted actions of the others in the minibatch, ``[B, W]``
+        :param minibatch: Their actions and visibility
+        :return: Eq. 7, a scalar
+        """
+        owners = th.as_tensor(self.layout.owners, device=prediction.device)
+        return action_loss(prediction, minibatch.others_actions, minibatch.others_visible, owners)
 
 
 class BeliefActorCriticPolicy(BeliefPolicyMixin, ActorCriticPolicy):

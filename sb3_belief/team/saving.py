@@ -8,20 +8,20 @@ import json
 import os
 import pathlib
 import pickle
-import platform
 import tempfile
 import zipfile
 import zlib
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_belief.versions import versions
+
 FORMAT = 1
-_PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "numpy", "gymnasium", "pettingzoo")
 
 
 @dataclass
@@ -90,7 +90,7 @@ def write_team(
     :param manifest: what goes into ``team.json`` besides the classes and versions
     """
     classes = {agent: f"{type(model).__module__}:{type(model).__qualname__}" for agent, model in models.items()}
-    manifest = {"format": FORMAT, "agents": list(models), "classes": classes, **manifest, "versions": _versions()}
+    manifest = {"format": FORMAT, "agents": list(models), "classes": classes, **manifest, "versions": versions()}
     if isinstance(path, io.BufferedIOBase):
         _write_archive(path, models, statistics, manifest)
         return
@@ -166,17 +166,6 @@ def _write_archive(
             archive.writestr(f"agents/{agent}.zip", buffer.getvalue())
             if agent in statistics:
                 archive.writestr(f"agents/{agent}.vecnormalize.pkl", pickle.dumps(statistics[agent]))
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    versions["sb3-belief"] = (pathlib.Path(__file__).parents[1] / "version.txt").read_text().strip()
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return versions
 
 
 def _umask() -> int:

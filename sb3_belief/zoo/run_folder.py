@@ -5,19 +5,16 @@ import os
 import platform
 import shlex
 import time
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import sb3_belief
+from sb3_belief.versions import versions
 from sb3_belief.zoo.errors import ConfigError
 
 CONFIG = "config.yml"
 RECORD = "run.json"
 TEAM = "team.zip"
 CHECKPOINTS = "checkpoints"
-
-_PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "pettingzoo", "supersuit", "greenlet", "numpy")
 
 
 def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) -> Path:
@@ -55,20 +52,6 @@ def remove_run_folder(folder: Path) -> None:
     except OSError:
         # not empty: there are other runs
         pass
-
-
-def versions() -> dict[str, str]:
-    """
-    :return: the versions that a result depends on
-    """
-    # from the package itself: a checkout that is run in place is not known to pip
-    found = {"python": platform.python_version(), "sb3-belief": sb3_belief.__version__}
-    for package in _PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
 
 
 class RunRecord:
