@@ -1,13 +1,14 @@
 """Stable-Baselines3 for many agents: one model each, and for them a dynamic belief about the others."""
 
 from sb3_belief import envs
-from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO
+from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.versions import __version__
 
 __all__ = [
     "BeliefActorCriticPolicy",
     "BeliefPPO",
+    "MaskableBeliefPPO",
     "Team",
     "TeamVecEnv",
     "__version__",

@@ -2,18 +2,25 @@
 
 from sb3_belief.belief.history import History, append_rows, empty_history
 from sb3_belief.belief.layout import ActionLayout
-from sb3_belief.belief.loss import action_loss, kl_divergence
-from sb3_belief.belief.network import BeliefOutput, DynamicBelief, HistoryContext, n_kept
+from sb3_belief.belief.loss import ACTION_LOSSES, cross_entropy, expected_actions, kl_divergence, squared_error
+from sb3_belief.belief.network import SIMILARITIES, BeliefOutput, DynamicBelief, HistoryContext, n_kept
+from sb3_belief.belief.variants import VARIANTS, Variant
 
 __all__ = [
+    "ACTION_LOSSES",
+    "SIMILARITIES",
+    "VARIANTS",
     "ActionLayout",
     "BeliefOutput",
     "DynamicBelief",
     "History",
     "HistoryContext",
-    "action_loss",
+    "Variant",
     "append_rows",
+    "cross_entropy",
     "empty_history",
+    "expected_actions",
     "kl_divergence",
     "n_kept",
+    "squared_error",
 ]

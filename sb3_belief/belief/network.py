@@ -14,7 +14,10 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_belief.belief.history import History
+from sb3_belief.belief.variants import VARIANTS
 
+#: What history rows are compared by to find those that resemble the present (Fig. 5b)
+SIMILARITIES = ("embedding", "observation")
 # The deviation of the belief stays between 0.7 % and 7.4 times that of the prior: beyond that its log-likelihood and
 # the sampled latent are numerically useless
 LOG_STD_RANGE = (-5.0, 2.0)
@@ -22,19 +25,20 @@ LOG_STD_RANGE = (-5.0, 2.0)
 
 class BeliefOutput(NamedTuple):
     """
-    :param latent: The belief ``delta`` given to policy and value, ``[B, z]`` (eq. 5)
+    :param latent: The belief ``delta``, ``[B, z]`` (eq. 5)
     :param mean: Mean of its distribution, ``[B, z]``
-    :param log_std: Log standard deviation of its distribution, ``[B, z]``
-    :param prediction: The others' predicted actions, flattened, ``[B, W]``
+    :param log_std: Log standard deviation of its distribution, ``[B, z]``; minus infinity where it is a single point
+    :param prediction: The others' predicted actions, flattened, ``[B, W]``: numbers or logits, whatever the loss makes of
+        them; None for a belief that predicts nothing
     :param kept: The history rows attended to, as indices into the rows filled so far, long ``[B, N_h]``;
-        ``N_h`` is 0 while the history is empty
+        ``N_h`` is 0 while the history is empty, and for a belief without one
     :param weights: Their attention weights, ``[B, N_h]``, each row sums to one
     """
 
     latent: th.Tensor
     mean: th.Tensor
     log_std: th.Tensor
-    prediction: th.Tensor
+    prediction: th.Tensor | None
     kept: th.Tensor
     weights: th.Tensor
 
@@ -43,7 +47,7 @@ class HistoryContext(NamedTuple):
     """
     A history as the network sees it; constant as long as neither the history nor the weights change.
 
-    :param directions: Embedded observations, scaled to length one for the cosine similarity, ``[T, d]``
+    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``
     :param keys: ``[T, d]``
     :param values: ``[T, d]``
     """
@@ -66,11 +70,16 @@ class DynamicBelief(nn.Module):
     """
     What the agent believes the others will do now, inferred from its observation and its history.
 
+    Every variant is this network less the parts that it does not use: those are not built, so that all weights there are
+    take part.
+
     :param observation_dim: ``d_o``, width of the flattened observation
     :param action_dim: ``W``, width of the others' flattened actions
     :param embedding_dim: ``d``, width of embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param keep_ratio: ``p``, the share of the history that is attended to, in (0, 1]
+    :param variant: A key of :data:`~sb3_belief.belief.VARIANTS`
+    :param similarity: What history rows are compared by: ``"embedding"`` (eq. 3) or the ``"observation"`` itself (Fig. 5b)
     """
 
     def __init__(
@@ -80,6 +89,8 @@ class DynamicBelief(nn.Module):
         embedding_dim: int = 64,
         latent_dim: int = 64,
         keep_ratio: float = 0.05,
+        variant: str = "dynamic",
+        similarity: str = "embedding",
     ) -> None:
         super().__init__()
         self.observation_dim = observation_dim
@@ -87,15 +98,29 @@ class DynamicBelief(nn.Module):
         self.embedding_dim = embedding_dim
         self.latent_dim = latent_dim
         self.keep_ratio = keep_ratio
+        self.variant = VARIANTS[variant]
+        self.similarity = similarity
         self.observation_embedding = nn.Sequential(
             nn.Linear(observation_dim, embedding_dim), nn.ReLU(), nn.Linear(embedding_dim, embedding_dim)
         )
-        self.action_embedding = nn.Linear(action_dim, embedding_dim)
-        self.query = nn.Linear(embedding_dim, embedding_dim, bias=False)
-        self.key = nn.Linear(embedding_dim, embedding_dim, bias=False)
-        self.value = nn.Linear(embedding_dim, embedding_dim, bias=False)
-        self.encoder = nn.Linear(embedding_dim, 2 * latent_dim)
-        self.decoder = nn.Linear(latent_dim, action_dim)
+        if self.variant.attends:
+            self.action_embedding = nn.Linear(action_dim, embedding_dim)
+            self.query = nn.Linear(embedding_dim, embedding_dim, bias=False)
+            self.key = nn.Linear(embedding_dim, embedding_dim, bias=False)
+            self.value = nn.Linear(embedding_dim, embedding_dim, bias=False)
+        self.encoder: nn.Module
+        if self.variant.predicts:
+            self.encoder = nn.Linear(embedding_dim, (2 if self.variant.samples else 1) * latent_dim)
+            self.decoder = nn.Linear(latent_dim, action_dim)
+        else:
+            hidden = self._hidden_of_wide()
+            self.encoder = nn.Sequential(nn.Linear(embedding_dim, hidden), nn.ReLU(), nn.Linear(hidden, latent_dim))
+
+    def _hidden_of_wide(self) -> int:
+        """The hidden width with which ``wide`` has as many weights as ``dynamic``, to half a hidden unit's."""
+        w, d, z = self.action_dim, self.embedding_dim, self.latent_dim
+        beyond_embedding = (w + 1) * d + 3 * d**2 + (d + 1) * 2 * z + (z + 1) * w
+        return max(1, round((beyond_embedding - z) / (d + 1 + z)))
 
     def encode_history(self, history: History) -> HistoryContext:
         """
@@ -105,43 +130,63 @@ class DynamicBelief(nn.Module):
         rows = history.filled()
         embeddings = self.observation_embedding(rows.observations)
         states = embeddings + self.action_embedding(rows.actions)
-        return HistoryContext(F.normalize(embeddings.detach(), dim=1), self.key(states), self.value(states))
+        directions = self._direction(rows.observations, embeddings)
+        return HistoryContext(directions, self.key(states), self.value(states))
 
     def forward(
         self,
         observations: th.Tensor,
-        history: History,
+        history: History | None = None,
         noise: th.Tensor | None = None,
         kept: th.Tensor | None = None,
         context: HistoryContext | None = None,
     ) -> BeliefOutput:
         """
         :param observations: ``[B, d_o]``
-        :param history: The agent's history
-        :param noise: Standard normal noise ``[B, z]`` for eq. 5; without it the belief is its mean
+        :param history: The agent's history; a variant that does not attend ignores it
+        :param noise: Standard normal noise ``[B, z]`` for eq. 5; without it the belief is its mean. A variant that does not
+            sample ignores it
         :param kept: The rows to attend to, ``[B, N_h]``, if they have been selected before; by default those most
             similar to each observation are selected here (eq. 3)
         :param context: ``encode_history(history)``, if it is at hand
         :return: The belief and all that belongs to it
+        :raises ValueError: if a variant that attends is given no history, or more rows are to be kept than it has
         """
-        if context is None:
-            context = self.encode_history(history)
         embedding = self.observation_embedding(observations)
-        if kept is None:
-            kept = self._most_similar(embedding, context)
-        summary, weights = self._attend(embedding, context, kept)
-        mean, log_std = self.encoder(embedding + summary).chunk(2, dim=1)
-        log_std = log_std.clamp(*LOG_STD_RANGE)
-        latent = mean if noise is None else mean + log_std.exp() * noise
-        return BeliefOutput(latent, mean, log_std, self.decoder(latent), kept, weights)
+        if self.variant.attends:
+            if context is None:
+                if history is None:
+                    raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
+                context = self.encode_history(history)
+            if kept is None:
+                kept = self._most_similar(observations, embedding, context)
+            summary, weights = self._attend(embedding, context, kept)
+            embedding = embedding + summary
+        else:
+            kept = th.zeros(len(observations), 0, dtype=th.long, device=observations.device)
+            weights = embedding.new_zeros(kept.shape)
+        encoded = self.encoder(embedding)
+        if self.variant.samples:
+            mean, log_std = encoded.chunk(2, dim=1)
+            log_std = log_std.clamp(*LOG_STD_RANGE)
+            latent = mean if noise is None else mean + log_std.exp() * noise
+        else:
+            latent = mean = encoded
+            log_std = th.full_like(mean, -math.inf)
+        prediction = self.decoder(latent) if self.variant.predicts else None
+        return BeliefOutput(latent, mean, log_std, prediction, kept, weights)
+
+    def _direction(self, observations: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
+        compared = embeddings if self.similarity == "embedding" else observations
+        return F.normalize(compared.detach(), dim=1)
 
     @th.no_grad()
-    def _most_similar(self, embedding: th.Tensor, context: HistoryContext) -> th.Tensor:
+    def _most_similar(self, observations: th.Tensor, embeddings: th.Tensor, context: HistoryContext) -> th.Tensor:
         """
         Eq. 3, with the sign that its text asks for: printed, the equation keeps the *least* similar rows. The choice
         is discrete, so no gradient flows through it.
         """
-        similarity = F.normalize(embedding, dim=1) @ context.directions.T
+        similarity = self._direction(observations, embeddings) @ context.directions.T
         return similarity.topk(n_kept(self.keep_ratio, similarity.shape[1]), dim=1, sorted=False).indices
 
     def _attend(self, embedding: th.Tensor, context: HistoryContext, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -149,6 +194,8 @@ class DynamicBelief(nn.Module):
         Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
         names no softmax; "scaled" is read as in the transformer, by the root of the width.
         """
+        if kept.shape[1] > len(context.keys):
+            raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(context.keys)}; keep at most as many")
         if kept.shape[1] == 0:
             return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
         scores = self.query(embedding) @ context.keys.T / math.sqrt(self.embedding_dim)

@@ -2,6 +2,13 @@
 
 from sb3_belief.belief_ppo.belief_ppo import BeliefPPO
 from sb3_belief.belief_ppo.buffers import BeliefDictRolloutBuffer, BeliefMinibatch, BeliefRolloutBuffer
+from sb3_belief.belief_ppo.maskable import (
+    MaskableBeliefActorCriticPolicy,
+    MaskableBeliefDictRolloutBuffer,
+    MaskableBeliefPPO,
+    MaskableBeliefRolloutBuffer,
+)
+from sb3_belief.belief_ppo.others import OthersPrediction
 from sb3_belief.belief_ppo.policies import BeliefActorCriticPolicy
 
 __all__ = [
@@ -10,4 +17,9 @@ __all__ = [
     "BeliefMinibatch",
     "BeliefPPO",
     "BeliefRolloutBuffer",
+    "MaskableBeliefActorCriticPolicy",
+    "MaskableBeliefDictRolloutBuffer",
+    "MaskableBeliefPPO",
+    "MaskableBeliefRolloutBuffer",
+    "OthersPrediction",
 ]

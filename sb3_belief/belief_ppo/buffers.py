@@ -18,8 +18,8 @@ class BeliefMinibatch(NamedTuple):
     """
     What a minibatch holds beyond SB3's samples; ``B`` rows, in the same order.
 
-    :param noise: The noise of eq. 5 with which the agent acted, ``[B, z]``
-    :param kept: The history rows it attended to, ``[B, N_h]``
+    :param noise: The noise of eq. 5 with which the agent acted, ``[B, z]``; of width 0 for a belief that does not sample
+    :param kept: The history rows it attended to, ``[B, N_h]``; of width 0 for a belief without a history
     :param others_actions: ``[B, W]``, zero where not visible
     :param others_visible: bool ``[B, n_others]``
     """
@@ -40,8 +40,8 @@ _EXTRAS = ("noise", "kept", "others_actions", "others_visible", "active")
 
 class BeliefBufferMixin(_Buffer):
     """
-    :param latent_dim: ``z``, 0 without a belief
-    :param history_kept: The most history rows that are attended to, ``N_h``, 0 without a belief
+    :param noise_dim: ``z``, 0 where no belief is sampled
+    :param history_kept: The most history rows that are attended to, ``N_h``, 0 where none are
     :param others_width: ``W``, 0 without a belief
     :param n_others: Number of others, 0 without a belief
     """
@@ -55,14 +55,14 @@ class BeliefBufferMixin(_Buffer):
     def __init__(
         self,
         *args: Any,
-        latent_dim: int = 0,
+        noise_dim: int = 0,
         history_kept: int = 0,
         others_width: int = 0,
         n_others: int = 0,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
-        self._widths = dict(noise=latent_dim, kept=history_kept, others_actions=others_width, others_visible=n_others)
+        self._widths = dict(noise=noise_dim, kept=history_kept, others_actions=others_width, others_visible=n_others)
         #: Told of every minibatch before SB3 gets its part of it
         self.on_minibatch: Callable[[BeliefMinibatch], None] | None = None
         super().__init__(*args, **kwargs)
@@ -132,19 +132,25 @@ class BeliefBufferMixin(_Buffer):
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """
         :param batch_size: Rows of a minibatch, before inactive steps are left out of it; None for all at once
-        :return: Minibatches as SB3 yields them, without any inactive step
+        :return: Minibatches as SB3 yields them, without any inactive step; what is left of one then, if less than two rows,
+            goes with the next
         """
         if not self.generator_ready:
             for name in _EXTRAS:
                 array = getattr(self, name)
                 setattr(self, name, array.swapaxes(0, 1).reshape(self.active.size, *array.shape[2:]))
-        for samples in super().get(batch_size):
-            if len(samples.actions):
-                yield samples
+        self._held = np.zeros(0, dtype=int)
+        yield from (samples for samples in super().get(batch_size) if samples is not None)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
-        batch_inds = batch_inds[self.active[batch_inds]]
-        if self.on_minibatch is not None and len(batch_inds):
+        if not self.active.all():
+            batch_inds = np.concatenate([self._held, batch_inds[self.active[batch_inds]]])
+            # A single row has no advantage statistics (sb3-contrib would divide by nothing): it goes with the next minibatch
+            if len(batch_inds) < 2:
+                self._held = batch_inds
+                return None
+            self._held = batch_inds[:0]
+        if self.on_minibatch is not None:
             self.on_minibatch(self.belief_minibatch(batch_inds))
         return super()._get_samples(batch_inds, env)
 

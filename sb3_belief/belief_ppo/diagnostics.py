@@ -5,9 +5,10 @@ import math
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer, MaskableRolloutBuffer
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_belief.belief import ActionLayout, BeliefOutput, kl_divergence
+from sb3_belief.belief import ActionLayout, kl_divergence
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefFusion
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
@@ -22,15 +23,16 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     :param policy: A policy with a belief
     :param buffer: Its rollout, complete, before the update that trains on it
     :return: By name, over up to 256 active steps spread evenly over the rollout:
-        ``action_loss`` (eq. 7) and ``kl``, as they enter eq. 8 before their weights;
+        ``action_loss`` (eq. 7, or the cross-entropy in its place) and ``kl``, as they enter eq. 8 before their weights;
         ``accuracy`` of the most likely action of each visible other, and ``base_rate``, that of always naming each other's
-        most frequent action (only for discrete actions);
+        most frequent action (for one-hot actions: Discrete, MultiDiscrete);
         ``history_gain``, how much the action loss rises when the history's actions are shuffled across its rows (0 while
-        the history is empty);
+        the history is empty, and for a belief without one);
         ``attention_entropy``, of the attention weights, in nats, at most log N_h;
         ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
         ``visible_fraction``, share of the others that are visible;
-        ``first_log_ratio``, largest |log ratio| of the policies that acted and that is trained: 0 but for rounding
+        ``first_log_ratio``, largest |log ratio| of the policies that acted and that is trained: 0 but for rounding.
+        What a belief does not have (a prediction, a latent that is sampled, rows attended to) is left out
     """
     rows = np.flatnonzero(buffer.active)
     rows = rows[np.linspace(0, len(rows) - 1, min(PROBE_ROWS, len(rows))).astype(int)]
@@ -40,25 +42,27 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     observations = obs_as_tensor({k: v[step] for k, v in raw.items()} if isinstance(raw, dict) else raw[step], policy.device)
     flat = policy.flat_observations(observations)
 
-    assert policy.belief is not None and policy.history is not None
-    history = policy.history
-    output = policy.belief(flat, history, minibatch.noise, minibatch.kept)
+    belief, variant = policy.belief, policy.options.variant
+    assert belief is not None and variant is not None and isinstance(policy.mlp_extractor, BeliefFusion)
     measured = dict(
-        action_loss=float(policy.action_error(output.prediction, minibatch)),
-        kl=float(kl_divergence(output.mean, output.log_std)),
         visible_fraction=float(minibatch.others_visible.float().mean()),
-        attention_entropy=float(-(output.weights * output.weights.clamp(min=1e-12).log()).sum(dim=1).mean()),
-        history_gain=0.0,
+        fusion_ratio=policy.mlp_extractor.belief_share(),
         first_log_ratio=_first_log_ratio(policy, buffer, step, observations, minibatch),
+        history_gain=0.0,
     )
-    if history.valid.any():
-        with_shuffled = history._replace(actions=_shuffled(history.actions, history.valid))
-        shuffled = policy.belief(flat, with_shuffled, minibatch.noise, minibatch.kept)
-        loss = float(policy.action_error(shuffled.prediction, minibatch))
-        measured["history_gain"] = loss - measured["action_loss"]
-    if isinstance(policy.mlp_extractor, BeliefFusion):
-        measured["fusion_ratio"] = policy.mlp_extractor.belief_share()
-    accuracy, base_rate = _accuracies(output, minibatch, policy.layout)
+    output = belief(flat, policy.history, minibatch.noise, minibatch.kept)
+    if variant.samples:
+        measured["kl"] = float(kl_divergence(output.mean, output.log_std))
+    if variant.attends:
+        measured["attention_entropy"] = float(-(output.weights * output.weights.clamp(min=1e-12).log()).sum(dim=1).mean())
+    if output.prediction is None:
+        return measured
+    measured["action_loss"] = float(policy.action_error(output.prediction, minibatch))
+    if policy.history is not None and policy.history.valid.any():
+        with_shuffled = policy.history._replace(actions=_shuffled(policy.history.actions, policy.history.valid))
+        shuffled = belief(flat, with_shuffled, minibatch.noise, minibatch.kept)
+        measured["history_gain"] = float(policy.action_error(shuffled.prediction, minibatch)) - measured["action_loss"]
+    accuracy, base_rate = _accuracies(output.prediction, minibatch, policy.layout)
     if not math.isnan(accuracy):
         measured["accuracy"], measured["base_rate"] = accuracy, base_rate
     return measured
@@ -83,18 +87,21 @@ def _first_log_ratio(
     actions = buffer.to_torch(buffer.actions[step])
     if isinstance(policy.action_space, spaces.Discrete):
         actions = actions.long().flatten()
+    masks = {}
+    if isinstance(buffer, (MaskableRolloutBuffer, MaskableDictRolloutBuffer)):
+        masks["action_masks"] = buffer.to_torch(buffer.action_masks[step])
     policy.stage(minibatch)
-    _, log_prob, _ = policy.evaluate_actions(observations, actions)
+    _, log_prob, _ = policy.evaluate_actions(observations, actions, **masks)
     return float((log_prob - buffer.to_torch(buffer.log_probs[step])).abs().max())
 
 
-def _accuracies(output: BeliefOutput, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:
+def _accuracies(prediction: th.Tensor, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:
     """Accuracy and base rate over all visible discrete actions; not a number where there are none."""
     right = most_frequent = total = 0
     for owner, start, width in layout.blocks:
         visible = minibatch.others_visible[:, owner]
         taken = minibatch.others_actions[visible, start : start + width].argmax(dim=1)
-        right += int((output.prediction[visible, start : start + width].argmax(dim=1) == taken).sum())
+        right += int((prediction[visible, start : start + width].argmax(dim=1) == taken).sum())
         most_frequent += int(taken.bincount(minlength=width).max())
         total += len(taken)
     return (right / total, most_frequent / total) if total else (math.nan, math.nan)

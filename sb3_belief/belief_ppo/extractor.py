@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
+from sb3_belief.belief_ppo.options import BeliefOptions
 
 
 def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
@@ -32,8 +33,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
     :param observation_space: The agent's observation space
     :param features: Extractor of the features of the observation itself
     :param belief: The belief network
-    :param history_length: ``T_h``, how many of its own steps the agent remembers
-    :param detach_belief: Whether to keep the gradient of policy and value out of the belief network
+    :param options: What the user says about the belief
     """
 
     history_observations: th.Tensor
@@ -45,15 +45,16 @@ class BeliefExtractor(BaseFeaturesExtractor):
         observation_space: spaces.Space,
         features: BaseFeaturesExtractor,
         belief: DynamicBelief,
-        history_length: int,
-        detach_belief: bool,
+        options: BeliefOptions,
     ) -> None:
         super().__init__(observation_space, features.features_dim + belief.latent_dim)
         self.features = features
         self.belief = belief
-        self.detach_belief = detach_belief
-        for name, rows in empty_history(history_length, belief.observation_dim, belief.action_dim)._asdict().items():
-            self.register_buffer(f"history_{name}", rows)
+        self.options = options
+        if belief.variant.attends:
+            history = empty_history(options.history_length, belief.observation_dim, belief.action_dim)
+            for name, rows in history._asdict().items():
+                self.register_buffer(f"history_{name}", rows)
         #: What the last pass believed, and the noise it drew; for whoever called it
         self.output: BeliefOutput | None = None
         self.noise: th.Tensor | None = None
@@ -61,8 +62,10 @@ class BeliefExtractor(BaseFeaturesExtractor):
         self._context: tuple[tuple[tuple[int, int], ...], HistoryContext] | None = None
 
     @property
-    def history(self) -> History:
-        """The history the belief is inferred from at present."""
+    def history(self) -> History | None:
+        """The history the belief is inferred from at present; None for a belief without one."""
+        if not self.belief.variant.attends:
+            return None
         return History(self.history_observations, self.history_actions, self.history_valid)
 
     def remember(self, observations: th.Tensor, actions: th.Tensor) -> None:
@@ -70,8 +73,9 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :param observations: Preprocessed flat observations of further steps, oldest first, ``[N, d_o]``
         :param actions: The others' actions at those steps, ``[N, W]``, zero where not visible
         """
-        history = append_rows(self.history, observations, actions)
-        self.history_observations, self.history_actions, self.history_valid = history
+        if self.history is not None:
+            history = append_rows(self.history, observations, actions)
+            self.history_observations, self.history_actions, self.history_valid = history
 
     @contextmanager
     def conditioned(
@@ -93,23 +97,36 @@ class BeliefExtractor(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor | TensorDict) -> th.Tensor:
         noise, kept, sample = self._given
         flat = flatten_observation(observations)
-        if sample:
+        if sample and self.belief.variant.samples:
             noise = th.randn(len(flat), self.belief.latent_dim, device=flat.device)
-        context = None if th.is_grad_enabled() else self._cached_context()
-        self.output = self.belief(flat, self.history, noise, kept, context)
+        self.output = output = self.infer(flat, noise, kept)
         self.noise = noise
-        latent = self.output.latent.detach() if self.detach_belief else self.output.latent
+        # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
+        latent = output.latent if self.options.policy_latent == "sample" else output.mean
+        if self.options.detach_belief:
+            latent = latent.detach()
         return th.cat([self.features(observations), latent], dim=1)
 
-    def _cached_context(self) -> HistoryContext:
+    def infer(self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None) -> BeliefOutput:
+        """
+        :param flat: Preprocessed flat observations, ``[B, d_o]``
+        :param noise: The noise of eq. 5, ``[B, z]``; without it the belief is its mean
+        :param kept: The history rows to attend to, ``[B, N_h]``; without them the most similar ones
+        :return: The belief, from the present history
+        """
+        history = self.history
+        context = None if history is None or th.is_grad_enabled() else self._cached_context(history)
+        return self.belief(flat, history, noise, kept, context)
+
+    def _cached_context(self, history: History) -> HistoryContext:
         """
         Between two updates neither weights nor history change, so the encoded history is kept. Whether they did is told by
         PyTorch's version counters, which every optimiser step and every load moves: no caller has to think of it.
         """
-        tensors = [*self.belief.parameters(), *self.history]
+        tensors = [*self.belief.parameters(), *history]
         state = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors)
         if self._context is None or self._context[0] != state:
-            self._context = state, self.belief.encode_history(self.history)
+            self._context = state, self.belief.encode_history(history)
         return self._context[1]
 
 

@@ -1,30 +1,32 @@
 """Actor-critic policies whose features hold a belief about the other agents."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_belief.belief import DynamicBelief, History, action_loss, kl_divergence
+from sb3_belief.belief import ACTION_LOSSES, DynamicBelief, History, expected_actions, kl_divergence
 from sb3_belief.belief_ppo.auxiliary import add_loss
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flatten_observation
-from sb3_belief.belief_ppo.others import action_layout
-
-BELIEFS = ("dynamic", "none")
-#: The default of ``latent_dim``
-LATENT_DIM = 64
+from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
+from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
 else:
     _Policy = object
+
+# The least height and width that NatureCNN's convolutions leave anything of
+_MIN_IMAGE_SIZE = 36
 
 
 class BeliefPolicyMixin(_Policy):
@@ -33,52 +35,66 @@ class BeliefPolicyMixin(_Policy):
     `get_distribution`, `predict_values`) go through the features extractor, so that is where the belief is inferred, once a
     pass, for policy and value alike; what is left here is to say how it is drawn.
 
+    :param observation_space: As in SB3
+    :param action_space: As in SB3
+    :param lr_schedule: As in SB3
+    :param features_extractor_class: As in SB3; None for the policy's usual one
     :param others_action_spaces: The others' action spaces in their fixed order; none without others
-    :param belief: ``"dynamic"``, the paper's method, or ``"none"``: then, and without others, this is SB3's policy
-    :param history_length: ``T_h``, how many of its own steps the agent remembers, at least 1
-    :param keep_ratio: ``p``, the share of them that is attended to, in (0, 1]
-    :param detach_belief: Whether to keep the gradient of policy and value out of the belief network
+    :param belief: As in :class:`~sb3_belief.BeliefPPO`; with ``"none"``, and without others, this is SB3's policy
+    :param history_length: As in :class:`~sb3_belief.BeliefPPO`
+    :param keep_ratio: As in :class:`~sb3_belief.BeliefPPO`
+    :param action_loss: As in :class:`~sb3_belief.BeliefPPO`
+    :param policy_latent: As in :class:`~sb3_belief.BeliefPPO`
+    :param similarity: As in :class:`~sb3_belief.BeliefPPO`
+    :param detach_belief: As in :class:`~sb3_belief.BeliefPPO`
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
     """
 
+    #: The features extractor if the user names none; None for the one that fits the observation space
+    default_extractor: ClassVar[type[BaseFeaturesExtractor] | None] = None
+
     def __init__(
         self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
         *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         others_action_spaces: Mapping[str, spaces.Space] | None = None,
         belief: str = "dynamic",
         history_length: int = 800,
         keep_ratio: float = 0.05,
+        action_loss: str = "mse",
+        policy_latent: str = "sample",
+        similarity: str = "embedding",
         detach_belief: bool = False,
-        embedding_dim: int = 64,
+        embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
         **kwargs: Any,
     ) -> None:
-        check_belief(belief, history_length, keep_ratio)
+        # All this before SB3's constructor, which builds the networks
+        self.options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, int) or width < 1:
                 raise ValueError(f"{name} is {width!r}; it must be an integer of at least 1")
-        others = dict(others_action_spaces or {})
-        # Before SB3's constructor, which builds the networks
-        self._belief_kwargs: dict[str, Any] = dict(
-            others_action_spaces=others,
-            belief=belief,
-            history_length=history_length,
-            keep_ratio=keep_ratio,
-            detach_belief=detach_belief,
-            embedding_dim=embedding_dim,
-            latent_dim=latent_dim,
-            fusion_activation_fn=fusion_activation_fn,
-        )
-        self.layout = action_layout(others)
-        self.has_belief = belief != "none" and self.layout.n_others > 0
+        self.others_action_spaces = dict(others_action_spaces or {})
+        self.embedding_dim = embedding_dim
+        self.latent_dim = latent_dim
+        self.fusion_activation_fn = fusion_activation_fn
+        self.layout = action_layout(self.others_action_spaces)
+        self.options.check_others(self.others_action_spaces, self.layout)
+        self.has_belief = self.options.variant is not None and self.layout.n_others > 0
         #: Weights of the two terms of the belief's loss (eq. 8), set by the algorithm before each update
         self.action_coef = 0.5
         self.kl_coef = 0.005
         self._minibatch: BeliefMinibatch | None = None
-        super().__init__(*args, **kwargs)
+        if features_extractor_class is None:
+            features_extractor_class = self.default_extractor or fitting_extractor(observation_space)
+        kwargs["features_extractor_class"] = features_extractor_class
+        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         if self.has_belief and not self.share_features_extractor:
             raise ValueError(
                 "share_features_extractor=False would give the value a belief of its own; policy and value share the belief "
@@ -91,17 +107,18 @@ class BeliefPolicyMixin(_Policy):
         features = super().make_features_extractor()
         if not self.has_belief:
             return features
-        options = self._belief_kwargs
         # A belief must not shift the random stream from which SB3 draws the other weights
         with th.random.fork_rng(devices=[]):
             belief = DynamicBelief(
                 get_flattened_obs_dim(self.observation_space),
                 self.layout.width,
-                options["embedding_dim"],
-                options["latent_dim"],
-                options["keep_ratio"],
+                self.embedding_dim,
+                self.latent_dim,
+                self.options.keep_ratio,
+                self.options.belief,
+                self.options.similarity,
             )
-        return BeliefExtractor(self.observation_space, features, belief, options["history_length"], options["detach_belief"])
+        return BeliefExtractor(self.observation_space, features, belief, self.options)
 
     def _build_mlp_extractor(self) -> None:
         if not self.has_belief:
@@ -109,10 +126,10 @@ class BeliefPolicyMixin(_Policy):
             return
         self.mlp_extractor = BeliefFusion(  # type: ignore[assignment]
             self._extractor.features.features_dim,
-            self._belief_kwargs["latent_dim"],
+            self.latent_dim,
             self.net_arch,
             self.activation_fn,
-            self._belief_kwargs["fusion_activation_fn"],
+            self.fusion_activation_fn,
             self.device,
         )
 
@@ -125,7 +142,15 @@ class BeliefPolicyMixin(_Policy):
             super().init_weights(module, gain)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), **self._belief_kwargs}
+        return {
+            **super()._get_constructor_parameters(),
+            "share_features_extractor": self.share_features_extractor,  # SB3 forgets it
+            **asdict(self.options),
+            "others_action_spaces": self.others_action_spaces,
+            "embedding_dim": self.embedding_dim,
+            "latent_dim": self.latent_dim,
+            "fusion_activation_fn": self.fusion_activation_fn,
+        }
 
     # -- what the algorithm uses ---------------------------------------------------------------------------------------
 
@@ -141,7 +166,7 @@ class BeliefPolicyMixin(_Policy):
 
     @property
     def history(self) -> History | None:
-        """The history from which the belief is inferred at present, if there is a belief."""
+        """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
 
     def remember(self, observations: PyTorchObs, actions: th.Tensor) -> None:
@@ -161,7 +186,8 @@ class BeliefPolicyMixin(_Policy):
 
     def acted_with(self) -> tuple[th.Tensor, th.Tensor]:
         """
-        :return: Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`
+        :return: Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`; of width 0 for a belief
+            that does not sample, or does not attend
         """
         return self._acted_with
 
@@ -182,7 +208,10 @@ class BeliefPolicyMixin(_Policy):
         with extractor.conditioned(sample=not deterministic):
             result = super().forward(obs, deterministic, *args, **kwargs)
         assert extractor.output is not None
-        noise = th.zeros_like(extractor.output.mean) if extractor.noise is None else extractor.noise
+        noise = extractor.noise
+        if noise is None:
+            mean = extractor.output.mean
+            noise = th.zeros_like(mean if extractor.belief.variant.samples else mean[:, :0])
         self._acted_with = noise, extractor.output.kept
         return result
 
@@ -201,44 +230,100 @@ class BeliefPolicyMixin(_Policy):
             values, log_prob, entropy = super().evaluate_actions(obs, actions, *args, **kwargs)
         loss = self.belief_loss(minibatch)
         extractor.output = None  # it holds the graph of this minibatch
-        return add_loss(values, loss), log_prob, entropy
+        return values if loss is None else add_loss(values, loss), log_prob, entropy
 
-    def belief_loss(self, minibatch: BeliefMinibatch) -> th.Tensor:
+    def belief_loss(self, minibatch: BeliefMinibatch) -> th.Tensor | None:
         """
         :param minibatch: The minibatch whose belief the extractor has inferred last
-        :return: The two terms of eq. 8 that train the belief, a scalar
+        :return: The terms of eq. 8 that train the belief, a scalar; None if there are none
         """
-        output = self._extractor.output
-        assert output is not None
-        error = self.action_error(output.prediction, minibatch)
-        return self.action_coef * error + self.kl_coef * kl_divergence(output.mean, output.log_std)
+        output, variant = self._extractor.output, self.options.variant
+        assert output is not None and variant is not None
+        if output.prediction is None:
+            return None
+        loss = self.action_coef * self.action_error(output.prediction, minibatch)
+        if variant.samples:
+            loss = loss + self.kl_coef * kl_divergence(output.mean, output.log_std)
+        return loss
 
     def action_error(self, prediction: th.Tensor, minibatch: BeliefMinibatch) -> th.Tensor:
         """
         :param prediction: Predicted actions of the others in the minibatch, ``[B, W]``
         :param minibatch: Their actions and visibility
-        :return: Eq. 7, a scalar
+        :return: Eq. 7, or the cross-entropy in its place, a scalar
         """
-        owners = th.as_tensor(self.layout.owners, device=prediction.device)
-        return action_loss(prediction, minibatch.others_actions, minibatch.others_visible, owners)
+        loss = ACTION_LOSSES[self.options.action_loss]
+        return loss(prediction, minibatch.others_actions, minibatch.others_visible, self.layout)
+
+    # -- a belief one can look at --------------------------------------------------------------------------------------
+
+    def predict_others(self, observation: np.ndarray | dict[str, np.ndarray]) -> OthersPrediction:
+        """
+        What the agent believes the others do when it is shown an observation now. The prediction is that of the belief's mean.
+
+        :param observation: One observation or a batch of them, as :meth:`predict` takes them
+        :return: The others' expected actions, the belief behind them, and the history rows that it comes from
+        :raises ValueError: for a policy that predicts nothing
+        """
+        if not (self.has_belief and self.options.variant.predicts):  # type: ignore[union-attr]
+            raise ValueError(
+                f"this policy has belief={self.options.belief!r} and {self.layout.n_others} others: it predicts nobody's "
+                "actions. A belief that does needs others and one of 'dynamic', 'context', 'variational', 'static'."
+            )
+        self.set_training_mode(False)
+        tensor, vectorized = self.obs_to_tensor(observation)
+        with th.no_grad():
+            output = self._extractor.infer(self.flat_observations(tensor))
+            assert output.prediction is not None
+            expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
+
+        def shown(tensor: th.Tensor) -> np.ndarray:
+            array = tensor.cpu().numpy()
+            return array if vectorized else array[0]
+
+        return OthersPrediction(
+            {name: shown(expected[:, self.layout.columns_of(i)]) for i, name in enumerate(self.others_action_spaces)},
+            shown(output.mean),
+            shown(output.log_std.exp()),
+            shown(output.kept),
+            shown(output.weights),
+        )
+
+
+def fitting_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+    """
+    :param observation_space: Of the agent
+    :return: The features extractor of that one of SB3's policies that is meant for it
+    """
+    if isinstance(observation_space, spaces.Dict):
+        return CombinedExtractor
+    if is_image_space(observation_space):
+        _, height, width = observation_space.shape  # type: ignore[misc]
+        if min(height, width) >= _MIN_IMAGE_SIZE:
+            return NatureCNN
+    return FlattenExtractor
 
 
 class BeliefActorCriticPolicy(BeliefPolicyMixin, ActorCriticPolicy):
-    """SB3's ``ActorCriticPolicy`` with a belief; takes all of its arguments and those of :class:`BeliefPolicyMixin`."""
+    """
+    SB3's ``ActorCriticPolicy`` with a belief; takes all of its arguments and those of :class:`BeliefPolicyMixin`. Its features
+    extractor is the one that SB3's own policies have for the observation space: for vectors, images (at least 36x36), Dicts.
+    """
 
 
-def check_belief(belief: str, history_length: int, keep_ratio: float) -> None:
-    """
-    :raises ValueError: where one of them has no meaning; the message says what is allowed
-    """
-    if belief not in BELIEFS:
-        raise ValueError(f"belief is {belief!r}; it must be one of {', '.join(map(repr, BELIEFS))}")
-    if not isinstance(history_length, int) or history_length < 1:
-        raise ValueError(
-            f"history_length is {history_length!r}; it must be an integer of at least 1 (the paper uses 800). "
-            "For PPO without a history use belief='none'."
-        )
-    if not 0 < keep_ratio <= 1:
-        raise ValueError(
-            f"keep_ratio is {keep_ratio!r}; it must be in (0, 1]: the share of the history attended to (the paper uses 0.05)"
-        )
+class BeliefMlpPolicy(BeliefActorCriticPolicy):
+    """The same for vectors; images are flattened."""
+
+    default_extractor = FlattenExtractor
+
+
+class BeliefCnnPolicy(BeliefActorCriticPolicy):
+    """The same for images."""
+
+    default_extractor = NatureCNN
+
+
+class BeliefMultiInputPolicy(BeliefActorCriticPolicy):
+    """The same for Dicts."""
+
+    default_extractor = CombinedExtractor

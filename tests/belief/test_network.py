@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_belief.belief import ActionLayout, DynamicBelief, History, action_loss, append_rows, empty_history, kl_divergence
+from sb3_belief.belief import ActionLayout, DynamicBelief, History, append_rows, empty_history, kl_divergence, squared_error
 
 D_O, W, D, Z = 6, 5, 8, 4
 
@@ -84,7 +84,7 @@ def test_rows_can_be_selected_beforehand():
 
 def test_losses_equal_the_equations():
     th.manual_seed(0)
-    layout = ActionLayout([[3], [2]], [True, False])
+    layout = ActionLayout([[3], [2]], ["categorical", "number"])
     assert layout.owners == [0, 0, 0, 1, 1] and layout.blocks == [(0, 0, 3)]
     prediction, actions = th.randn(6, 5), th.randn(6, 5)
     visible = th.rand(6, 2) < 0.5
@@ -94,10 +94,10 @@ def test_losses_equal_the_equations():
             if visible[b, other]:
                 expected += sum(float(actions[b, c] - prediction[b, c]) ** 2 for c in columns)
                 count += 1
-    result = action_loss(prediction, actions, visible, th.as_tensor(layout.owners))
+    result = squared_error(prediction, actions, visible, layout)
     assert count > 2 and result.item() == pytest.approx(expected / count, rel=1e-5)
     nobody = th.zeros(6, 2, dtype=th.bool)
-    assert action_loss(prediction, actions, nobody, th.as_tensor(layout.owners)).item() == 0
+    assert squared_error(prediction, actions, nobody, layout).item() == 0
 
     mean, log_std = th.randn(6, Z), 0.3 * th.randn(6, Z)
     normal = th.distributions.Normal
@@ -110,7 +110,7 @@ def test_gradient_of_the_loss_reaches_every_module():
     history = History(th.randn(100, D_O), th.randn(100, W), th.ones(100, dtype=th.bool))
     output = net(th.randn(8, D_O), history, th.randn(8, Z))
     visible = th.ones(8, 1, dtype=th.bool)
-    loss = action_loss(output.prediction, th.randn(8, W), visible, th.zeros(W, dtype=th.long))
+    loss = squared_error(output.prediction, th.randn(8, W), visible, ActionLayout([[W]], ["number"]))
     (loss + kl_divergence(output.mean, output.log_std)).backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
@@ -132,5 +132,7 @@ def test_history_keeps_the_newest_rows_in_order():
 
 
 def test_layout_refuses_what_does_not_fit():
-    with pytest.raises(ValueError, match="2 others, categorical of 1"):
-        ActionLayout([[3], [2]], [True])
+    with pytest.raises(ValueError, match="2 others"):
+        ActionLayout([[3], [2]], ["categorical"])
+    with pytest.raises(ValueError, match="categorical, binary, number"):
+        ActionLayout([[3]], ["discrete"])

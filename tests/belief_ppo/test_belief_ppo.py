@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_belief.belief import action_loss, kl_divergence
+from sb3_belief.belief import kl_divergence, squared_error
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, BeliefRolloutBuffer
 from sb3_belief.belief_ppo.auxiliary import add_loss
 from sb3_belief.belief_ppo.others import action_layout, read_others
@@ -133,8 +133,7 @@ def test_gradient_equals_that_of_the_explicit_sum():
         ratio = (log_prob - th.as_tensor(buffer.log_probs.reshape(-1))).exp()
         loss = -th.min(advantages * ratio, advantages * ratio.clamp(0.8, 1.2)).mean()
         loss = loss - 0.01 * entropy.mean() + 0.7 * F.mse_loss(returns, values.flatten())
-        owners = th.as_tensor(policy.layout.owners)
-        loss = loss + 0.5 * action_loss(output.prediction, part.others_actions, part.others_visible, owners)
+        loss = loss + 0.5 * squared_error(output.prediction, part.others_actions, part.others_visible, policy.layout)
         loss = loss + 0.005 * kl_divergence(output.mean, output.log_std)
         policy.optimizer.zero_grad()
         loss.backward()
@@ -404,7 +403,7 @@ def test_others_are_read_in_order_and_zeroed_where_not_visible():
 @pytest.mark.parametrize(
     "kwargs, message",
     [
-        (dict(belief="psychic"), "'dynamic', 'none'"),
+        (dict(belief="psychic"), "'dynamic', 'context', 'variational', 'static', 'wide', 'none'"),
         (dict(history_length=0), "at least 1"),
         (dict(history_length=8.5), "integer"),
         (dict(keep_ratio=0.0), r"\(0, 1\]"),

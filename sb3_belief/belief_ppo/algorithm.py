@@ -1,0 +1,206 @@
+"""What makes an SB3 algorithm of PPO's kind one with a belief."""
+
+import warnings
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_belief.belief import n_kept
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
+from sb3_belief.belief_ppo.diagnostics import measure_belief
+from sb3_belief.belief_ppo.options import LATENT_DIM, BeliefOptions
+from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of, read_others
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+
+if TYPE_CHECKING:
+    _Algorithm = OnPolicyAlgorithm
+else:
+    _Algorithm = object
+
+
+class BeliefAlgorithmMixin(_Algorithm):
+    """
+    What makes an SB3 PPO one with a belief: it stages each step's part of the belief, sees to it that the belief's loss
+    joins each minibatch, and renews the history after each update. No method of SB3's is copied.
+    """
+
+    #: SB3's algorithm without the belief, for messages
+    stock: ClassVar[str]
+    #: Base class of the policies, and the rollout buffers for plain and for Dict observations
+    policy_base: ClassVar[type[BeliefPolicyMixin]]
+    buffer_classes: ClassVar[tuple[type[BeliefBufferMixin], type[BeliefBufferMixin]]]
+
+    policy: BeliefPolicyMixin
+    rollout_buffer: BeliefBufferMixin
+    others_action_spaces: ActionSpaces
+    belief: str
+    history_length: int
+    keep_ratio: float
+    action_loss: str
+    policy_latent: str
+    similarity: str
+    detach_belief: bool
+    action_coef: float | Schedule
+    kl_coef: float | Schedule
+
+    def _setup_belief(self, options: BeliefOptions, action_coef: float | Schedule, kl_coef: float | Schedule) -> None:
+        """Store the belief's arguments; called by the constructor between SB3's and `_setup_model`."""
+        for name, value in asdict(options).items():
+            setattr(self, name, value)
+        for name, coefficient in (("action_coef", action_coef), ("kl_coef", kl_coef)):
+            if not callable(coefficient) and not isinstance(coefficient, (float, int)):
+                raise TypeError(f"{name} is {coefficient!r}; it must be a number of at least 0, or a schedule of such numbers")
+            if not callable(coefficient) and coefficient < 0:
+                raise ValueError(f"{name} is {coefficient!r}; the weight of a loss must be at least 0")
+        self.action_coef = action_coef
+        self.kl_coef = kl_coef
+        # Whoever holds no belief about the others may meet any
+        self.others_action_spaces = {} if self.env is None or options.variant is None else others_of(self.env)
+
+    @property
+    def _options(self) -> BeliefOptions:
+        return BeliefOptions(**{field.name: getattr(self, field.name) for field in fields(BeliefOptions)})
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._check_others(self.env)
+            if self.belief != "none" and not self.others_action_spaces:
+                warnings.warn(
+                    f"The environment names no other agents, so there is nothing to hold a belief about: "
+                    f"{type(self).__name__} is {self.stock} here. Train a Team, or bring 'others_action_spaces'.",
+                    stacklevel=3,
+                )
+        if not issubclass(self.policy_class, self.policy_base):
+            raise TypeError(
+                f"{type(self).__name__} needs a policy with a belief, not {self.policy_class.__name__}; use 'BeliefPolicy' or "
+                f"derive yours from sb3_belief.belief_ppo.{self.policy_base.__name__}"
+            )
+        user_kwargs = self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs
+        plain, for_dicts = self.buffer_classes
+        if self.rollout_buffer_class is None:
+            self.rollout_buffer_class = for_dicts if isinstance(self.observation_space, spaces.Dict) else plain
+        elif not issubclass(self.rollout_buffer_class, BeliefBufferMixin):
+            raise TypeError(
+                f"rollout_buffer_class is {self.rollout_buffer_class.__name__}, which has no place for what a belief is "
+                f"trained on; derive it from sb3_belief.belief_ppo.{plain.__name__} (or {for_dicts.__name__})"
+            )
+        self.policy_kwargs = {
+            **self.policy_kwargs,
+            "others_action_spaces": self.others_action_spaces,
+            **asdict(self._options),
+        }
+        self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, **self._buffer_widths()}
+        try:
+            super()._setup_model()
+        finally:
+            # What is saved, and compared on load, is what the user gave
+            self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs = user_kwargs
+        # As SB3 does with its own coefficients that may be schedules
+        self.action_coef, self.kl_coef = FloatSchedule(self.action_coef), FloatSchedule(self.kl_coef)
+
+    def _buffer_widths(self) -> dict[str, int]:
+        layout, variant = action_layout(self.others_action_spaces), self._options.variant
+        if variant is None or layout.n_others == 0:
+            return {}
+        return dict(
+            noise_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM) if variant.samples else 0,
+            history_kept=n_kept(self.keep_ratio, self.history_length) if variant.attends else 0,
+            others_width=layout.width,
+            n_others=layout.n_others,
+        )
+
+    def _check_others(self, env: VecEnv) -> None:
+        if self.belief == "none":
+            return
+        found = others_of(env)
+        if found != self.others_action_spaces:
+            raise ValueError(
+                f"the others of this environment are {found}, but the model has been made for {self.others_action_spaces}; "
+                "a belief is about these others with these action spaces, in this order"
+            )
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        refuse_many_agents(env, type(self).__name__)
+        self._check_others(self._wrap_env(env, verbose=0))
+        super().set_env(env, force_reset)
+
+    # -- rollout -------------------------------------------------------------------------------------------------------
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        # SB3 calls this once a step, right before it adds the step to the buffer: the place to stage the rest of the row
+        super()._update_info_buffer(infos, dones)
+        active = np.array([info.get("active", True) for info in infos], dtype=bool)
+        if not self.policy.has_belief:
+            self.rollout_buffer.stage(active)
+            return
+        actions, visible = read_others(infos, self.policy.layout)
+        minibatch = BeliefMinibatch(*self.policy.acted_with(), th.as_tensor(actions), th.as_tensor(visible))
+        self.rollout_buffer.stage(active, minibatch)
+
+    # -- update --------------------------------------------------------------------------------------------------------
+
+    def train(self) -> None:
+        """
+        SB3's update, in which each minibatch also trains the belief. Thereafter the history becomes the agent's own last
+        steps: this rollout's, which the next rollout and its update look back on, never the one being trained on.
+        """
+        buffer, policy = self.rollout_buffer, self.policy
+        # A single step has no advantage statistics, and is no rollout to learn from
+        learns = buffer.active.sum() > 1
+        if not policy.has_belief or not buffer.active.any():
+            if learns:
+                self._update()
+            return
+        observations, actions = buffer.recent(self.history_length)
+        for name, value in measure_belief(policy, buffer).items():
+            self.logger.record(f"belief/{name}", value)
+        policy.action_coef, policy.kl_coef = self._coefficient("action_coef"), self._coefficient("kl_coef")
+        buffer.on_minibatch = policy.stage
+        try:
+            if learns:
+                self._update()
+        finally:
+            buffer.on_minibatch = None
+            policy.stage(None)
+        policy.remember(obs_as_tensor(observations, self.device), th.as_tensor(actions, device=self.device))
+
+    def _coefficient(self, name: str) -> float:
+        """The weight of a loss at this time of the training."""
+        value = getattr(self, name)(self._current_progress_remaining)
+        if value < 0:
+            raise ValueError(
+                f"the schedule {name} gives {value!r} with {self._current_progress_remaining:.3f} of the training left; the "
+                "weight of a loss must be at least 0"
+            )
+        self.logger.record(f"train/{name}", value)
+        return value
+
+    def _update(self) -> None:
+        super().train()
+        # SB3 computes this over all steps, also those in which the agent was not in play and no value is trained
+        active, values, returns = (getattr(self.rollout_buffer, name).flatten() for name in ("active", "values", "returns"))
+        self.logger.record("train/explained_variance", explained_variance(values[active], returns[active]))
+
+
+def refuse_many_agents(env: Any, algorithm: str) -> None:
+    """
+    :param env: What a user gave as the environment of one agent
+    :param algorithm: Name of the algorithm it was given to
+    :raises TypeError: if it is an environment of many agents
+    """
+    is_pettingzoo = isinstance(env, (ParallelEnv, AECEnv))
+    if is_pettingzoo or (isinstance(env, VecEnv) and hasattr(env, "possible_agents")):
+        raise TypeError(
+            f"{algorithm} trains one agent, but {type(env).__name__} is an environment of many. To train one model per agent "
+            f'use Team({algorithm}, "BeliefPolicy", make_team_env(...)). To train one learner among fixed partners, wrap it '
+            "in a gymnasium.Env that plays the partners' part and shows the learner its own observation, with "
+            "'others_action_spaces', and 'others_actions' and 'others_visible' in info."
+        )

@@ -1,0 +1,190 @@
+"""Belief PPO with invalid action masking."""
+
+from typing import Any, ClassVar
+
+import torch as th
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer, MaskableRolloutBuffer
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_belief.belief_ppo.algorithm import BeliefAlgorithmMixin, refuse_many_agents
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin
+from sb3_belief.belief_ppo.options import BeliefOptions
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+
+
+class MaskableBeliefRolloutBuffer(BeliefBufferMixin, MaskableRolloutBuffer):
+    """sb3-contrib's rollout buffer with the belief's part of each step, see :class:`BeliefBufferMixin`."""
+
+
+class MaskableBeliefDictRolloutBuffer(BeliefBufferMixin, MaskableDictRolloutBuffer):
+    """The same for Dict observations."""
+
+
+# To a type checker the mixins stand on SB3's own classes, from which sb3-contrib's differ in these attributes
+class MaskableBeliefActorCriticPolicy(BeliefPolicyMixin, MaskableActorCriticPolicy):  # type: ignore[misc]
+    """
+    sb3-contrib's ``MaskableActorCriticPolicy`` with a belief; takes all of its arguments and those of
+    :class:`BeliefPolicyMixin`. Its features extractor is the one that fits the observation space.
+    """
+
+
+class MaskableBeliefMlpPolicy(MaskableBeliefActorCriticPolicy):
+    """The same for vectors; images are flattened."""
+
+    default_extractor = FlattenExtractor
+
+
+class MaskableBeliefCnnPolicy(MaskableBeliefActorCriticPolicy):
+    """The same for images."""
+
+    default_extractor = NatureCNN
+
+
+class MaskableBeliefMultiInputPolicy(MaskableBeliefActorCriticPolicy):
+    """The same for Dicts."""
+
+    default_extractor = CombinedExtractor
+
+
+class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc]
+    """
+    Belief PPO with invalid action masking: :class:`~sb3_belief.BeliefPPO` on sb3-contrib's ``MaskablePPO``, all of whose
+    arguments it takes. The masks are those of the environment's ``action_masks()``, in a Team those that its environment puts
+    into ``infos[agent]["action_mask"]``; they hold in rollout and update alike. Box actions cannot be masked.
+
+    :param policy: ``"BeliefPolicy"``, whose features extractor fits the observation space, one of SB3's names ``"MlpPolicy"``,
+        ``"CnnPolicy"``, ``"MultiInputPolicy"``, or a class derived from :class:`MaskableBeliefActorCriticPolicy`
+    :param env: The environment of this one agent
+    :param learning_rate: As in MaskablePPO
+    :param n_steps: As in MaskablePPO
+    :param batch_size: As in MaskablePPO; inactive steps are left out of a minibatch after it is drawn
+    :param n_epochs: As in MaskablePPO
+    :param gamma: As in MaskablePPO
+    :param gae_lambda: As in MaskablePPO
+    :param clip_range: As in MaskablePPO
+    :param clip_range_vf: As in MaskablePPO
+    :param normalize_advantage: As in MaskablePPO
+    :param ent_coef: As in MaskablePPO
+    :param vf_coef: As in MaskablePPO
+    :param max_grad_norm: As in MaskablePPO; the belief's gradient is clipped together with the rest
+    :param rollout_buffer_class: A class derived from :class:`MaskableBeliefRolloutBuffer`
+    :param rollout_buffer_kwargs: As in MaskablePPO
+    :param target_kl: As in MaskablePPO
+    :param stats_window_size: As in MaskablePPO
+    :param tensorboard_log: As in MaskablePPO
+    :param policy_kwargs: As in MaskablePPO, and ``embedding_dim``, ``latent_dim``, ``fusion_activation_fn`` of
+        :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin`
+    :param verbose: As in MaskablePPO
+    :param seed: As in MaskablePPO
+    :param device: As in MaskablePPO
+    :param _init_setup_model: As in MaskablePPO
+    :param belief: As in BeliefPPO
+    :param history_length: As in BeliefPPO
+    :param keep_ratio: As in BeliefPPO
+    :param action_coef: As in BeliefPPO
+    :param kl_coef: As in BeliefPPO
+    :param action_loss: As in BeliefPPO
+    :param policy_latent: As in BeliefPPO
+    :param similarity: As in BeliefPPO
+    :param detach_belief: As in BeliefPPO
+    :raises TypeError: for an environment of many agents, with the ways to train on it
+    :raises ValueError: for an argument without meaning, with what is allowed
+    """
+
+    stock = "MaskablePPO"
+    policy_base = MaskableBeliefActorCriticPolicy
+    buffer_classes = (MaskableBeliefRolloutBuffer, MaskableBeliefDictRolloutBuffer)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "BeliefPolicy": MaskableBeliefActorCriticPolicy,
+        "MlpPolicy": MaskableBeliefMlpPolicy,
+        "CnnPolicy": MaskableBeliefCnnPolicy,
+        "MultiInputPolicy": MaskableBeliefMultiInputPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[MaskableBeliefActorCriticPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int | None = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        belief: str = "dynamic",
+        history_length: int = 800,
+        keep_ratio: float = 0.05,
+        action_coef: float | Schedule = 0.5,
+        kl_coef: float | Schedule = 0.005,
+        action_loss: str = "mse",
+        policy_latent: str = "sample",
+        similarity: str = "embedding",
+        detach_belief: bool = False,
+    ) -> None:
+        refuse_many_agents(env, type(self).__name__)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
+        self._setup_belief(options, action_coef, kl_coef)
+        if _init_setup_model:
+            self._setup_model()
+
+    def learn(  # type: ignore[override]
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "MaskableBeliefPPO",
+        reset_num_timesteps: bool = True,
+        use_masking: bool = True,
+        progress_bar: bool = False,
+    ) -> "MaskableBeliefPPO":
+        """As MaskablePPO's ``learn``."""
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, use_masking, progress_bar
+        )

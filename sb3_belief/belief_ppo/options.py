@@ -1,0 +1,75 @@
+"""What a user may say about a belief, and what makes no sense."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from sb3_belief.belief import ACTION_LOSSES, SIMILARITIES, VARIANTS, ActionLayout, Variant
+
+#: The variants, and PPO without a belief
+BELIEFS = (*VARIANTS, "none")
+POLICY_LATENTS = ("sample", "mean")
+#: Default widths of the embeddings and of the belief
+EMBEDDING_DIM = 64
+LATENT_DIM = 64
+
+
+@dataclass(frozen=True)
+class BeliefOptions:
+    """
+    The belief's arguments, as :class:`~sb3_belief.BeliefPPO` explains them.
+
+    :raises ValueError: for what has no meaning; the message says what is allowed
+    """
+
+    belief: str = "dynamic"
+    history_length: int = 800
+    keep_ratio: float = 0.05
+    action_loss: str = "mse"
+    policy_latent: str = "sample"
+    similarity: str = "embedding"
+    detach_belief: bool = False
+
+    def __post_init__(self) -> None:
+        _check_choice("belief", self.belief, BELIEFS)
+        _check_choice("action_loss", self.action_loss, ACTION_LOSSES)
+        _check_choice("policy_latent", self.policy_latent, POLICY_LATENTS)
+        _check_choice("similarity", self.similarity, SIMILARITIES)
+        if not isinstance(self.history_length, int) or self.history_length < 1:
+            raise ValueError(
+                f"history_length is {self.history_length!r}; it must be an integer of at least 1, so that there is a row to "
+                "attend to (the paper uses 800). For a belief without a history use belief='variational' or 'static'."
+            )
+        if not 0 < self.keep_ratio <= 1:
+            raise ValueError(
+                f"keep_ratio is {self.keep_ratio!r}; it must be in (0, 1]: the share of the history attended to (the paper "
+                "uses 0.05). For a belief that attends to none of it use belief='variational' or 'static'."
+            )
+        if self.detach_belief and self.belief == "wide":
+            raise ValueError(
+                "belief='wide' is trained by nothing but the gradient of policy and value, which detach_belief=True keeps out "
+                "of it; leave detach_belief False."
+            )
+
+    @property
+    def variant(self) -> Variant | None:
+        """The parts of the belief; None without one."""
+        return VARIANTS.get(self.belief)
+
+    def check_others(self, names: Collection[str], layout: ActionLayout) -> None:
+        """
+        :param names: The others, in their order
+        :param layout: How their actions are coded
+        :raises ValueError: where the loss cannot be computed for the actions of one of them
+        """
+        if self.action_loss == "cross_entropy" and self.variant is not None and self.variant.predicts:
+            numbers = [name for name, kind in zip(names, layout.kinds, strict=True) if kind == "number"]
+            if numbers:
+                raise ValueError(
+                    f"action_loss='cross_entropy' needs actions that are chosen from a finite set, but those of "
+                    f"{', '.join(numbers)} are numbers (Box); use action_loss='mse'."
+                )
+
+
+def _check_choice(name: str, value: str, allowed: Collection[str]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, allowed))}")
