@@ -19,11 +19,11 @@ class AgentVecEnv(VecEnv):
     """
     An SB3 ``VecEnv`` with one agent's own spaces, that steps only together with the others' in ``Team.learn``.
 
-    ``infos[e]`` holds ``others_actions`` float32 [W] (the others in order: one-hot for Discrete and MultiDiscrete, values for
-    Box and MultiBinary; zero where not visible), ``others_visible`` bool [n_others], ``active`` bool, at a done
-    ``terminal_observation`` and ``TimeLimit.truncated``, and at the end of the team's episode ``episode`` (with the agent's
-    own return) and ``is_success``. ``get_attr("others_action_spaces")`` tells the others' spaces, and where the environment
-    gives action masks ``env_method("action_masks")`` those of the agent.
+    ``infos[e]`` holds ``others_actions`` float32 [W] (the others in order, the scripted ones last: one-hot for Discrete and
+    MultiDiscrete, values for Box and MultiBinary; zero where not visible), ``others_visible`` bool [n_others], ``active``
+    bool, at a done ``terminal_observation`` and ``TimeLimit.truncated``, and at the end of the team's episode ``episode``
+    (with the agent's own return) and ``is_success``. ``get_attr("others_action_spaces")`` tells the others' spaces, and where
+    the environment gives action masks ``env_method("action_masks")`` those of the agent.
 
     :param hub: steps the team
     :param agent: name of the agent
@@ -33,8 +33,9 @@ class AgentVecEnv(VecEnv):
         self.agent = agent
         self._hub = hub
         self._actions = np.zeros(0)
-        space = hub.action_spaces[agent]
-        super().__init__(hub.num_envs, hub.observation_spaces[agent], space)
+        self._others_action_spaces = {other: space for other, space in hub.action_spaces.items() if other != agent}
+        self._others_action_spaces.update(hub.scripted_action_spaces)
+        super().__init__(hub.num_envs, hub.observation_spaces[agent], hub.action_spaces[agent])
 
     def reset(self) -> np.ndarray:
         """
@@ -71,7 +72,7 @@ class AgentVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         known: dict[str, Any] = {
             "render_mode": self._hub.env.render_mode,
-            "others_action_spaces": {other: space for other, space in self._hub.action_spaces.items() if other != self.agent},
+            "others_action_spaces": dict(self._others_action_spaces),
         }
         masks = self._hub.masks
         if masks is not None and self.agent in masks:

@@ -7,6 +7,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.team.scripted import ScriptedOthers, optional_member
+
 Flags: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -16,15 +18,17 @@ class StepRecord(NamedTuple):
 
     :param agent_rewards: of the n agents
     :param flags: active, life_end and truncated, bool [n] each
-    :param visible: bool [n, n-1]
+    :param visible: bool [n, n-1+n_scripted]
     :param action_masks: the masks of all agents for their next actions one after the other (True where an agent has none);
         None if the environment gives none
+    :param scripted_actions: what the scripted others did, flattened, float32 [W_scripted]; None if there are none
     """
 
     agent_rewards: list[float]
     flags: Flags
     visible: np.ndarray
     action_masks: np.ndarray | None
+    scripted_actions: np.ndarray | None
 
 
 class JointEnv(gym.Env):
@@ -36,7 +40,7 @@ class JointEnv(gym.Env):
     The info of a step has a ``StepRecord`` as ``joint``, of which ``ParallelTeamVecEnv`` makes the infos of a ``TeamVecEnv``.
 
     :param env: the environment, see the README for what it may offer beyond PettingZoo's interface
-    :raises TypeError: if it is not a ``ParallelEnv``
+    :raises TypeError: if it is not a ``ParallelEnv``, or is wrong about its scripted others
     """
 
     def __init__(self, env: ParallelEnv):
@@ -54,8 +58,14 @@ class JointEnv(gym.Env):
         self.render_mode = getattr(env, "render_mode", None)
         self.metadata = getattr(env, "metadata", {})
 
-        agents = range(len(self.possible_agents))
-        self._others = np.array([[j for j in agents if j != i] for i in agents], dtype=int).reshape(len(agents), -1)
+        self._scripted = ScriptedOthers(env)
+        self.scripted_action_spaces = self._scripted.action_spaces
+
+        agents, n_scripted = range(len(self.possible_agents)), len(self.scripted_action_spaces)
+        # The scripted ones come after the agents, for every viewer
+        everybody = range(len(agents) + n_scripted)
+        self._others = np.array([[j for j in everybody if j != i] for i in agents], dtype=int).reshape(len(agents), -1)
+        self._scripted_in_play = np.ones(n_scripted, dtype=bool)
         self._mask_widths = {agent: mask_width(self.action_spaces[agent]) for agent in self.possible_agents}
         # Shared by the records of all steps at which nothing happens
         self._uneventful = _no_flags(len(agents))
@@ -63,8 +73,8 @@ class JointEnv(gym.Env):
         self._all_visible = np.ones(self._others.shape, dtype=bool)
         for shared in (*self._uneventful, self._all_visible):
             shared.flags.writeable = False
-        self._visibility = getattr(env, "visibility", None)
-        self._team_reward = getattr(env, "team_reward", None)
+        self._visibility = optional_member(env, "visibility")
+        self._team_reward = optional_member(env, "team_reward")
         self._zero_obs = {
             agent: np.zeros(space.shape or (), dtype=space.dtype) for agent, space in self.observation_spaces.items()
         }
@@ -103,7 +113,8 @@ class JointEnv(gym.Env):
         team_reward = sum(agent_rewards) / len(agents) if self._team_reward is None else self._team_reward(rewards)
         visible = self._all_visible if flags is self._uneventful and self._visibility is None else self._visible(flags)
         masks = self._masks(infos).get("action_masks") if told or self._has_masks else None
-        info: dict[str, Any] = {"joint": StepRecord(agent_rewards, flags, visible, masks)}
+        scripted_actions = self._scripted.actions() if self.scripted_action_spaces else None
+        info: dict[str, Any] = {"joint": StepRecord(agent_rewards, flags, visible, masks, scripted_actions)}
         if flags is self._uneventful:
             return obs, float(team_reward), False, False, info
         observations = self._observations(obs)
@@ -181,12 +192,25 @@ class JointEnv(gym.Env):
 
     def _visible(self, flags: Flags) -> np.ndarray:
         # Who is not in play neither sees nor shows anything
-        in_play = flags[0][self._others] & flags[0][:, None]
+        active = flags[0]
+        if self.scripted_action_spaces:
+            # An environment tells by its visibility() when they do not show themselves
+            in_play = np.concatenate([active, self._scripted_in_play])[self._others] & active[:, None]
+        else:
+            in_play = active[self._others] & active[:, None]
         if self._visibility is None:
             return in_play
         rows = self._visibility()
         unseen = np.zeros(self._others.shape[1], dtype=bool)
-        return np.array([rows.get(agent, unseen) for agent in self.possible_agents], dtype=bool) & in_play
+        given = [rows.get(agent, unseen) for agent in self.possible_agents]
+        try:
+            return np.array(given, dtype=bool).reshape(in_play.shape) & in_play
+        except ValueError:
+            raise ValueError(
+                f"visibility() must return {in_play.shape[1]} flags for each agent, the other agents in the order of"
+                f" possible_agents and then the scripted others {list(self.scripted_action_spaces)}; it returned"
+                f" {[np.size(row) for row in given]} for {self.possible_agents}."
+            ) from None
 
     def _masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
         self._has_masks = self._has_masks or any("action_mask" in info for info in infos.values())

@@ -72,7 +72,8 @@ class Lockstep:
         # Copies: a model seeds its action space and samples from it
         self.action_spaces = {agent: deepcopy(env.action_space[agent]) for agent in self.possible_agents}  # type: ignore[index]
         self._team_env = team_env
-        self._views = TeamViews(self.possible_agents, self.action_spaces)
+        self.scripted_action_spaces = deepcopy(team_env.scripted_action_spaces)
+        self._views = TeamViews(self.possible_agents, self.action_spaces, self.scripted_action_spaces)
         self._members: dict[str, Member] = {}
         self._main: greenlet | None = None
         self._first: dict[str, np.ndarray] = {}
@@ -86,6 +87,13 @@ class Lockstep:
         self._vote = True
         self.n_steps = 0
         self.agent_envs = {agent: AgentVecEnv(self, agent) for agent in self.possible_agents}
+
+    @property
+    def scripted(self) -> dict[str, str]:
+        """
+        :return: {name of a scripted other: its action space in words}, in order
+        """
+        return {name: str(space) for name, space in self.scripted_action_spaces.items()}
 
     # For the agents' environments and callbacks
 

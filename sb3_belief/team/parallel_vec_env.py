@@ -33,17 +33,25 @@ class ParallelTeamVecEnv(TeamVecEnv):
         else:
             envs = [env_fn() for env_fn in env_fns]
             # Before DummyVecEnv stumbles over them
-            check_spaces(envs[0].possible_agents, envs[0].observation_spaces, envs[0].action_spaces)
+            first = envs[0]
+            check_spaces(first.possible_agents, first.observation_spaces, first.action_spaces, first.scripted_action_spaces)
             self.venv = _InProcessVecEnv([partial(_same, env) for env in envs])
             self.venv.layout = [
-                (agent, (len(envs), *(space.shape or ())), space.dtype) for agent, space in envs[0].observation_spaces.items()
+                (agent, (len(envs), *(space.shape or ())), space.dtype) for agent, space in first.observation_spaces.items()
             ]
         self._interrupted = False
         self._masks: np.ndarray | None = None
         agents: list[str] = self.venv.get_attr("possible_agents", [0])[0]
         self._action_spaces: dict[str, spaces.Space] = self.venv.get_attr("action_spaces", [0])[0]
         self._observation_spaces: dict[str, spaces.Space] = self.venv.get_attr("observation_spaces", [0])[0]
-        super().__init__(len(env_fns), agents, self._observation_spaces, self._action_spaces, self.venv.render_mode)
+        super().__init__(
+            len(env_fns),
+            agents,
+            self._observation_spaces,
+            self._action_spaces,
+            self.venv.render_mode,
+            self.venv.get_attr("scripted_action_spaces", [0])[0],
+        )
         self._discrete = [isinstance(self._action_spaces[agent], spaces.Discrete) for agent in agents]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -123,6 +131,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
                 "life_end": life_end,
                 "truncated": truncated,
             }
+            if record.scripted_actions is not None:
+                info["scripted_actions"] = record.scripted_actions
             if len(venv_info) > 1:
                 info.update(venv_info)
                 del info["joint"]

@@ -56,11 +56,19 @@ class SavedTeam:
             raise ValueError(f"The saved agent {agent!r} names {name}, which is not an SB3 algorithm.")
         return found
 
-    def check_env(self, env: VecEnv, agents: list[str]) -> None:
+    @property
+    def scripted(self) -> dict[str, str]:
+        """
+        :return: {name of a scripted other: its action space in words}, in order; files that tell nothing of them had none
+        """
+        return self.manifest.get("scripted_action_spaces", {})
+
+    def check_env(self, env: VecEnv, agents: list[str], scripted: dict[str, str]) -> None:
         """
         :param env: the environment that the team is to have
         :param agents: its agents
-        :raises ValueError: if agents or spaces differ, saying how
+        :param scripted: its scripted others and their action spaces in words, in order
+        :raises ValueError: if agents, scripted others or spaces differ, saying how
         """
         saved_agents = list(self.manifest["agents"])
         if saved_agents != agents:
@@ -71,6 +79,8 @@ class SavedTeam:
                 saved, given = self.manifest[f"{name}_spaces"][agent], str(here[agent])  # type: ignore[index]
                 if saved != given:
                     differences.append(f"{agent}: {name} space saved as {saved}, environment has {given}")
+        if list(self.scripted.items()) != list(scripted.items()):
+            differences.append(f"scripted others saved as {self.scripted}, environment has {scripted} (in this order)")
         if differences:
             raise ValueError("The environment does not fit the saved team: " + "; ".join(differences) + ".")
 
@@ -141,16 +151,20 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
     return SavedTeam(manifest, models, statistics)
 
 
-def spaces_manifest(observation_space: spaces.Dict, action_space: spaces.Dict, agents: list[str]) -> dict[str, Any]:
+def spaces_manifest(
+    observation_space: spaces.Dict, action_space: spaces.Dict, agents: list[str], scripted: dict[str, str]
+) -> dict[str, Any]:
     """
     :param observation_space: of the team
     :param action_space: of the team
     :param agents: names of the agents
+    :param scripted: the scripted others and their action spaces in words, in order
     :return: the entries of ``team.json`` that ``SavedTeam.check_env`` compares with
     """
     return {
         "observation_spaces": {agent: str(observation_space[agent]) for agent in agents},
         "action_spaces": {agent: str(action_space[agent]) for agent in agents},
+        "scripted_action_spaces": scripted,
     }
 
 

@@ -83,7 +83,7 @@ class Team:
         check_names("agent_kwargs", own_kwargs, agents)
         recipes = {agent: (classes[agent], policies[agent], {**kwargs, **own_kwargs.get(agent, {})}) for agent in agents}
         roster = Roster.build(recipes, hub, seed, normalize, max(verbose - 1, 0), device)
-        self._setup(hub, roster, seed, normalize, verbose, log_dir, tensorboard_log)
+        self._setup(hub, roster, hub.scripted, seed, normalize, verbose, log_dir, tensorboard_log)
         if seed is not None:
             env.seed(seed)
 
@@ -91,6 +91,7 @@ class Team:
         self,
         hub: Lockstep | None,
         roster: Roster,
+        scripted: dict[str, str],
         seed: int | None,
         normalize: bool | dict[str, Any],
         verbose: int,
@@ -99,6 +100,7 @@ class Team:
     ) -> None:
         self._hub = hub
         self._roster = roster
+        self._scripted = scripted
         self.agents: dict[str, BaseAlgorithm] = roster.models
         self.possible_agents = list(roster.models)
         self.seed = seed
@@ -261,7 +263,7 @@ class Team:
             "seed": self.seed,
             "num_timesteps": self.num_timesteps,
             "normalize": self.normalize,
-            **spaces_manifest(self.observation_space, self.action_space, self.possible_agents),
+            **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
         write_team(path, self.agents, self._roster.statistics, manifest)
 
@@ -289,11 +291,11 @@ class Team:
         saved = read_team(path)
         hub = None if env is None else Lockstep(check_env(env))
         if hub is not None:
-            saved.check_env(hub.env, hub.possible_agents)
+            saved.check_env(hub.env, hub.possible_agents, hub.scripted)
         seed = saved.manifest["seed"]
         team = cls.__new__(cls)
         roster = Roster.load(saved, hub, seed=seed, device=device)
-        team._setup(hub, roster, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log)
+        team._setup(hub, roster, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log)
         team.num_timesteps = saved.manifest["num_timesteps"]
         if env is not None and seed is not None:
             env.seed(seed)
@@ -307,7 +309,7 @@ class Team:
 
     def set_env(self, env: VecEnv) -> None:
         """
-        :param env: to learn in from now on, with the same agents, spaces and number of copies
+        :param env: to learn in from now on, with the same agents, scripted others, spaces and number of copies
         :raises RuntimeError: while the team is learning
         :raises ValueError: if it does not fit
         """
@@ -316,6 +318,10 @@ class Team:
         hub = Lockstep(check_env(env))
         if hub.possible_agents != self.possible_agents:
             raise ValueError(f"The team has the agents {self.possible_agents}, the environment {hub.possible_agents}.")
+        if list(hub.scripted.items()) != list(self._scripted.items()):
+            raise ValueError(
+                f"The team has learned with the scripted others {self._scripted}, the environment has {hub.scripted}."
+            )
         n_envs = next(iter(self.agents.values())).n_envs
         if env.num_envs != n_envs:
             raise ValueError(

@@ -26,10 +26,13 @@ class TeamVecEnv(VecEnv):
     ``infos[e]`` holds plain arrays, never dictionaries by agent, because SB3's vectorisers deep-copy infos each step:
 
     - ``agent_rewards`` float32 [n]
-    - ``visible`` bool [n, n-1]: row i says whose action of this step agent i could observe (the others in order)
+    - ``visible`` bool [n, n-1+n_scripted]: row i says whose action of this step agent i could observe (the other agents in
+      order, then the scripted others)
     - ``active`` bool [n]: was in play when it acted
     - ``life_end`` bool [n]: the agent's own return ended at this step (it terminated, or its life ended)
     - ``truncated`` bool [n]: the agent's own return was cut by a limit at this step (never together with ``life_end``)
+    - with scripted others only: ``scripted_actions`` float32 [W_scripted]: what they did in this step, one after the other as
+      ``gymnasium.spaces.flatten`` codes it
 
     and at the end of the team's episode also ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool,
     ``is_success`` bool (if the environment says), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
@@ -40,6 +43,8 @@ class TeamVecEnv(VecEnv):
     :param observation_spaces: space of each agent's observation (not nested: no ``Dict``, no ``Tuple``)
     :param action_spaces: space of each agent's action (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``)
     :param render_mode: render mode of the copies (None, "rgb_array" or "human")
+    :param scripted_action_spaces: action space of each scripted other (a partner that belongs to the environment and does not
+        learn) in order, of the same kinds; None: there are none
     :raises ValueError: for names or spaces that do not fit
     """
 
@@ -50,9 +55,11 @@ class TeamVecEnv(VecEnv):
         observation_spaces: Mapping[str, spaces.Space],
         action_spaces: Mapping[str, spaces.Space],
         render_mode: str | None = None,
+        scripted_action_spaces: Mapping[str, spaces.Space] | None = None,
     ):
         self.possible_agents = list(possible_agents)
-        check_spaces(self.possible_agents, observation_spaces, action_spaces)
+        self.scripted_action_spaces = dict(scripted_action_spaces or {})
+        check_spaces(self.possible_agents, observation_spaces, action_spaces, self.scripted_action_spaces)
         # VecEnv.__init__ asks for it through get_attr()
         self.render_mode = render_mode
         super().__init__(
@@ -236,12 +243,16 @@ def _difference(expected: Sequence[str], given: Iterable[str]) -> tuple[list[str
 
 
 def check_spaces(
-    agents: Sequence[str], observation_spaces: Mapping[str, spaces.Space], action_spaces: Mapping[str, spaces.Space]
+    agents: Sequence[str],
+    observation_spaces: Mapping[str, spaces.Space],
+    action_spaces: Mapping[str, spaces.Space],
+    scripted_action_spaces: Mapping[str, spaces.Space],
 ) -> None:
     """
     :param agents: names of the agents
     :param observation_spaces: of all agents
     :param action_spaces: of all agents
+    :param scripted_action_spaces: of the scripted others
     :raises ValueError: for names or spaces that a team cannot have
     """
     if not agents or len(set(agents)) != len(agents):
@@ -256,14 +267,19 @@ def check_spaces(
                 f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
                 " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
             )
-        allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
-        if not isinstance(action_spaces[agent], allowed):
+    both = [name for name in scripted_action_spaces if name in agents]
+    if both:
+        raise ValueError(
+            f"scripted_action_spaces has entries for {both}, which are agents: a scripted other does not learn, so its name"
+            f" must differ from the agents' {list(agents)}."
+        )
+    allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+    for name, space in {**action_spaces, **scripted_action_spaces}.items():
+        if not isinstance(space, allowed):
             raise ValueError(
-                f"The action space of {agent!r} is {action_spaces[agent]}; allowed are"
-                f" {', '.join(space.__name__ for space in allowed)}."
+                f"The action space of {name!r} is {space}; allowed are {', '.join(kind.__name__ for kind in allowed)}."
             )
-        if np.any(getattr(action_spaces[agent], "start", 0)):
+        if np.any(getattr(space, "start", 0)):
             raise ValueError(
-                f"The action space of {agent!r} is {action_spaces[agent]}: SB3 numbers actions from 0, so the environment"
-                " must too (start=0)."
+                f"The action space of {name!r} is {space}: SB3 numbers actions from 0, so the environment must too (start=0)."
             )

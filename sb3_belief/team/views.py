@@ -1,7 +1,8 @@
 """What each agent is given of a joint step: its own observation, reward and done, and others' actions that it could see."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,20 +30,29 @@ class TeamViews:
 
     :param possible_agents: names of the agents in order
     :param action_spaces: their action spaces
+    :param scripted_action_spaces: those of the scripted others, in order
     """
 
-    def __init__(self, possible_agents: Sequence[str], action_spaces: dict[str, spaces.Space]):
-        self._agents = list(possible_agents)
+    def __init__(
+        self,
+        possible_agents: Sequence[str],
+        action_spaces: dict[str, spaces.Space],
+        scripted_action_spaces: Mapping[str, spaces.Space] = MappingProxyType({}),
+    ):
+        self._agents, self._scripted = list(possible_agents), list(scripted_action_spaces)
         n_agents = len(self._agents)
+        self._n_others = n_agents - 1 + len(self._scripted)
         # All actions stand in one row of W_all columns, coded as gymnasium.spaces.flatten does it; column c is owner[c]'s
-        widths = [int(spaces.flatdim(action_spaces[agent])) for agent in self._agents]
+        all_spaces = [action_spaces[agent] for agent in self._agents] + list(scripted_action_spaces.values())
+        widths = [int(spaces.flatdim(space)) for space in all_spaces]
         starts = np.concatenate([[0], np.cumsum(widths)])
         self._width = int(starts[-1])
-        owner = np.repeat(np.arange(n_agents), widths)
+        self._scripted_columns = slice(int(starts[n_agents]), self._width)
+        owner = np.repeat(np.arange(len(widths)), widths)
         self._numbers: dict[str, slice] = {}
         self._discrete: list[str] = []
         offsets: list[np.ndarray] = []
-        for agent, start, stop in zip(self._agents, starts[:-1], starts[1:], strict=True):
+        for agent, (start, stop) in zip(self._agents, pairwise(starts[: n_agents + 1]), strict=True):
             sizes = _component_sizes(action_spaces[agent])
             if sizes is None:
                 self._numbers[agent] = slice(start, stop)
@@ -59,8 +69,8 @@ class TeamViews:
         owners = owner[self._sources] if pairs else np.zeros(0, dtype=int)
         seen_rows = owners - (owners > viewers)
         # Places in visible[i, j], laid out flat
-        self._seen = viewers * (n_agents - 1) + seen_rows
-        bounds = np.concatenate([[0], np.cumsum([self._width - width for width in widths])])
+        self._seen = viewers * self._n_others + seen_rows
+        bounds = np.concatenate([[0], np.cumsum([self._width - width for width in widths[:n_agents]])])
         self._parts = [slice(start, stop) for start, stop in pairwise(bounds)]
 
     def split(self, actions: TeamObs, step: TeamStep) -> list[AgentStep]:
@@ -68,19 +78,20 @@ class TeamViews:
         :param actions: {agent: array [num_envs, ...]} that led to the step
         :param step: what ``TeamVecEnv.step`` returned for them
         :return: for each agent observations [num_envs, ...], rewards float32 [num_envs], dones bool [num_envs] and infos
+        :raises ValueError: if the infos say too little or too much of who saw whom, or of the scripted others
         """
         obs, _, team_dones, infos = step
         n_envs, n_agents = len(infos), len(self._agents)
         # concatenate() takes a third of the time of array()
         rewards = np.concatenate([info["agent_rewards"] for info in infos]).astype(np.float32).reshape(n_envs, n_agents)
-        visible = np.concatenate([info["visible"] for info in infos], axis=None).reshape(n_envs, n_agents, n_agents - 1)
+        visible = self._rows("visible", (n_agents, self._n_others), infos)
         active = np.concatenate([info["active"] for info in infos]).reshape(n_envs, n_agents)
         life_end = np.concatenate([info["life_end"] for info in infos]).reshape(n_envs, n_agents)
         truncated = np.concatenate([info["truncated"] for info in infos]).reshape(n_envs, n_agents)
         dones = team_dones[:, None] | life_end | truncated
         # The value of an inactive slot is never trained, so it must not be bootstrapped from either
         cut = truncated & ~life_end & active
-        seen_actions = self._seen_actions(actions, visible)
+        seen_actions = self._seen_actions(actions, visible, infos)
         any_done = bool(dones.any())
 
         steps: list[AgentStep] = []
@@ -107,7 +118,19 @@ class TeamViews:
             if "is_success" in info:
                 agent_info["is_success"] = info["is_success"]
 
-    def _seen_actions(self, actions: TeamObs, visible: np.ndarray) -> np.ndarray:
+    def _rows(self, key: str, shape: tuple[int, ...], infos: list[dict[str, Any]]) -> np.ndarray:
+        """
+        :return: array [num_envs, *shape] of what all infos have under ``key``
+        """
+        try:
+            return np.concatenate([info[key] for info in infos], axis=None).reshape(len(infos), *shape)
+        except (KeyError, ValueError):
+            raise ValueError(
+                f"Each info of a TeamVecEnv with the agents {self._agents} and the scripted others {self._scripted} must have"
+                f" {key!r} of shape {shape}, got {[np.shape(info[key]) if key in info else None for info in infos]}."
+            ) from None
+
+    def _seen_actions(self, actions: TeamObs, visible: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """
         :return: float32 [num_envs, sum over agents of W]: what each is given of the others' actions
         """
@@ -118,6 +141,9 @@ class TeamViews:
             flat[np.arange(n_envs)[:, None], chosen.astype(int) + self._offsets] = 1.0
         for agent, columns in self._numbers.items():
             flat[:, columns] = actions[agent].reshape(n_envs, -1)
+        if self._scripted:
+            columns = self._scripted_columns
+            flat[:, columns] = self._rows("scripted_actions", (columns.stop - columns.start,), infos)
         seen = visible.reshape(n_envs, -1).take(self._seen, axis=1)
         # where() and not a product: an invisible action that is not a number must not come through as one
         return np.where(seen, flat.take(self._sources, axis=1), np.float32(0.0))

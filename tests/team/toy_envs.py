@@ -252,3 +252,58 @@ class FaultyEnv(ToyEnv):
                 os._exit(3)
             raise ArithmeticError("the toy broke")
         return super().step(actions)
+
+
+class PartneredEnv(ParallelEnv):
+    """
+    Two learners, and two scripted others that tell by what they do which step it was: ``wind`` (Box) does [step, -episode],
+    ``leader`` (Discrete) does (step - 1) % 4, as the observation before the step has it one-hot. Learner ``ball`` leaves after
+    step 3 and learner ``arrow`` goes on to the end of the episode, ``limit``, a time limit.
+
+    :param limit: length of an episode
+    :param ball_leaves: whether it does
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "partnered"}
+    render_mode = None
+
+    def __init__(self, limit: int = 6, ball_leaves: bool = True):
+        self.possible_agents = ["arrow", "ball"]
+        self.agents: list[str] = []
+        self.limit, self.ball_leaves = limit, ball_leaves
+        self.t = self.episode = 0
+        # the order is the dict's, not the alphabet's
+        self.scripted_action_spaces = {"wind": spaces.Box(-100, 100, (2,), np.float32), "leader": spaces.Discrete(4)}
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 1, (4,), np.float32)
+
+    def action_space(self, agent):
+        return spaces.Discrete(3) if agent == "arrow" else spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.t = self.possible_agents[:], 0
+        self.episode += 1
+        return self.observations(), {agent: {} for agent in self.agents}
+
+    def step(self, actions):
+        self.t += 1
+        over = {agent: self.t >= (3 if agent == "ball" and self.ball_leaves else self.limit) for agent in self.agents}
+        infos: dict[str, dict] = {agent: {} for agent in self.agents}
+        result = self.observations(), dict.fromkeys(self.agents, 1.0), dict.fromkeys(self.agents, False), over, infos
+        self.agents = [agent for agent in self.agents if not over[agent]]
+        return result
+
+    def scripted_actions(self):
+        return {"leader": (self.t - 1) % 4, "wind": np.array([self.t, -self.episode], np.float32)}
+
+    def observations(self):
+        return {agent: np.eye(4, dtype=np.float32)[self.t % 4] for agent in self.agents}
+
+
+class BlinkingEnv(PartneredEnv):
+    """As ``PartneredEnv``; at step t ``arrow`` sees those of [ball, wind, leader] whose bit is set in t, ``ball`` the rest."""
+
+    def visibility(self):
+        bits = np.array([self.t & 1, self.t & 2, self.t & 4], dtype=bool)
+        return {"arrow": bits, "ball": ~bits}
