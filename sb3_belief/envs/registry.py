@@ -52,6 +52,22 @@ _SPECS: dict[str, EnvSpec] = {
     for level in ("easy", "medium", "hard")
 }
 
+_SWITCHING_CONVENTION = "sb3_belief.envs.switching_convention"
+
+_SPECS |= {
+    f"convention-{game}": EnvSpec(
+        id=f"convention-{game}",
+        parallel=f"{_SWITCHING_CONVENTION}.parallel_env:SwitchingConvention",
+        kwargs=kwargs,
+        batched=f"{_SWITCHING_CONVENTION}.vec_env:SwitchingConventionVecEnv",
+    )
+    for game, kwargs in {
+        "swap": {"K": 2, "rewarded": "always"},
+        "watch-act": {"K": 2, "rewarded": "last"},
+        "redraw": {"K": 5, "rewarded": "always"},
+    }.items()
+}
+
 
 def registered_ids() -> list[str]:
     """

@@ -4,14 +4,30 @@ from typing import Any
 
 import pytest
 
-from sb3_belief.envs import EnvSpec, TrafficJunction, make_batched_env, make_parallel_env, registered_ids, spec
+from sb3_belief.envs import (
+    EnvSpec,
+    SwitchingConvention,
+    TrafficJunction,
+    make_batched_env,
+    make_parallel_env,
+    registered_ids,
+    spec,
+)
 from sb3_belief.envs import registry as registry_module
+from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
 
 
 def test_all_ids_make_what_they_say():
-    assert registered_ids() == ["traffic-junction-easy", "traffic-junction-medium", "traffic-junction-hard"]
-    for env_id, n_cars in zip(registered_ids(), (5, 10, 20), strict=True):
+    levels = ["traffic-junction-easy", "traffic-junction-medium", "traffic-junction-hard"]
+    games = ["convention-swap", "convention-watch-act", "convention-redraw"]
+    assert registered_ids() == levels + games
+    for env_id in games:
+        # what they stand for is tested with the environment
+        env, batched = make_parallel_env(env_id), make_batched_env(env_id, 3)
+        assert isinstance(env, SwitchingConvention) and isinstance(batched, SwitchingConventionVecEnv)
+        assert batched.config == env.config
+    for env_id, n_cars in zip(levels, (5, 10, 20), strict=True):
         env = make_parallel_env(env_id)
         assert isinstance(env, TrafficJunction)
         assert env.config.level == env_id.rsplit("-", 1)[1]

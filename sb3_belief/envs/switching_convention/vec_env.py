@@ -1,0 +1,97 @@
+"""Many switching conventions stepped at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
+from sb3_belief.envs.switching_convention.parallel_env import FOLLOWER, LEADER
+from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
+
+
+class SwitchingConventionVecEnv(TeamVecEnv):
+    """
+    ``num_envs`` copies of :class:`SwitchingConvention` in one numpy game, beside the same leader. Copy i seeded with s + i
+    (as ``seed(s)`` does, whose s is not the ``seed`` of the conventions) lives the same life, bit for bit, as one
+    :class:`SwitchingConvention` that was reset with the seed s + i and then without one. ``get_attr("convention")`` gives
+    each copy's current convention.
+
+    :param num_envs: number of copies, at least 1
+    :param env_kwargs: the arguments of :class:`SwitchingConvention`
+    :raises ValueError: for a value that is not allowed
+    """
+
+    def __init__(self, num_envs: int, **env_kwargs: Any):
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} must be at least 1.")
+        self.config = ConventionConfig(**env_kwargs)
+        self.game = ConventionGame(num_envs, self.config)
+        numbers = {FOLLOWER: spaces.Discrete(self.config.m)}
+        scripted: dict[str, spaces.Space] = {LEADER: spaces.Discrete(self.config.m)}
+        super().__init__(num_envs, [FOLLOWER], numbers, numbers, scripted_action_spaces=scripted)
+        self._one_hot = np.eye(self.config.m, dtype=np.float32)
+        # What all infos have in common
+        self._always = {
+            "visible": np.array([[self.config.leader_visible]]),
+            "active": np.ones(1, dtype=bool),
+            "life_end": np.zeros(1, dtype=bool),
+        }
+        self._limits = np.zeros(1, dtype=bool), np.ones(1, dtype=bool)
+        for shared in (*self._always.values(), *self._limits):
+            shared.flags.writeable = False
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        if attr_name == "convention":
+            return [self.game.conventions[copy].copy() for copy in self._get_indices(indices)]
+        return super().get_attr(attr_name, indices)
+
+    def _reset_joint(self) -> TeamObs:
+        for copy, seed in enumerate(self._seeds):
+            if seed is not None:
+                self.game.seed(copy, seed)
+        self.game.reset()
+        return {FOLLOWER: self.game.cue}
+
+    def _step_joint(self, actions: TeamObs) -> TeamStep:
+        chosen = actions[FOLLOWER]
+        if chosen.dtype.kind not in "iu" or chosen.min() < 0 or chosen.max() >= self.config.m:
+            raise ValueError(f"Actions must be integers from 0 to {self.config.m - 1}, got {np.unique(chosen).tolist()}.")
+        rewards, dones = self.game.step(chosen)
+        infos: list[dict[str, Any]] = [
+            {"agent_rewards": reward, "truncated": self._limits[done], "scripted_actions": scripted, **self._always}
+            for reward, done, scripted in zip(rewards[:, None], dones.tolist(), self._one_hot[self.game.leader], strict=True)
+        ]
+        cues = self.game.cue
+        ended = np.flatnonzero(dones)
+        if len(ended):
+            for copy in ended:
+                infos[copy]["TimeLimit.truncated"] = True
+                infos[copy]["terminal_observation"] = {FOLLOWER: cues[copy]}
+            self.game.reset(ended)
+            cues = self.game.cue
+        # The team's only agent: its reward is the team's, but nobody may get at the other's array
+        return {FOLLOWER: cues}, rewards.copy(), dones, infos
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """
+        :return: for each copy all that decides how it goes on
+        """
+        return [self.game.get_state(copy) for copy in range(self.num_envs)]
+
+    def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
+        """
+        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+
+        :param states: what ``get_state`` returned with as many copies and the same arguments
+        :return: the current cues, {agent: int64 [num_envs]}
+        :raises ValueError: if the number of copies or the arguments differ
+        """
+        if len(states) != self.num_envs:
+            raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")
+        for copy, state in enumerate(states):
+            self.game.set_state(copy, state)
+        self._zero_episode_sums()
+        return {FOLLOWER: self.game.cue}

@@ -1,0 +1,467 @@
+"""The switching conventions: what is rewarded, what is told of the leader, when it changes its mind."""
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from sb3_belief.belief_ppo import BeliefPPO
+from sb3_belief.envs import SwitchingConvention, make_batched_env, make_parallel_env
+from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
+from sb3_belief.team import Team, make_team_env
+from sb3_belief.team.lockstep import Lockstep
+
+VARIANTS: list[dict[str, Any]] = [
+    {},
+    {"m": 2, "K": 1, "rollout_steps": 1, "seed": 3},
+    {"m": 5, "K": 3, "rollout_steps": 4, "rewarded": "last", "seed": 1},
+    {"K": None, "rollout_steps": 3},
+    {"K": 2, "rollout_steps": 5, "leader_visible": False},
+]
+
+
+def conventions(n, m=4, K: int | None = 1, rollout_steps=1, **kwargs):
+    """
+    :return: the first n conventions of an environment, as it shows them
+    """
+    env = SwitchingConvention(m=m, K=K, rollout_steps=rollout_steps, **kwargs)
+    found = []
+    for _ in range(n):
+        found.append(env.convention)
+        for _ in range((K or 1) * rollout_steps):
+            if not env.agents:
+                env.reset()
+            env.step({"follower": 0})
+    return found
+
+
+@pytest.mark.parametrize("kwargs", VARIANTS)
+def test_pettingzoo_api_and_seeds(kwargs):
+    # any warning would be a deviation from the interface
+    parallel_api_test(SwitchingConvention(**kwargs), num_cycles=100)
+    parallel_seed_test(lambda: SwitchingConvention(**kwargs), num_cycles=100)
+
+
+def test_what_the_follower_and_others_are_told():
+    env = SwitchingConvention(m=6)
+    assert env.possible_agents == ["follower"]
+    assert env.observation_space("follower") == env.action_space("follower") == spaces.Discrete(6)
+    assert env.scripted_action_spaces == {"leader": spaces.Discrete(6)}
+    assert env.visibility()["follower"].tolist() == [True]
+    assert SwitchingConvention(leader_visible=False).visibility()["follower"].tolist() == [False]
+
+
+@pytest.mark.parametrize("kwargs", VARIANTS)
+def test_rewards_and_leader_step_by_step(kwargs):
+    env = SwitchingConvention(**kwargs)
+    rules = env.config
+    generator = np.random.default_rng(0)
+    obs, _ = env.reset(seed=11)
+    n_rewarded = n_switches = 0
+    life = (rules.K or 1) * rules.rollout_steps
+    for age in range(4 * life + rules.rollout_steps):
+        cue, convention = obs["follower"], env.convention
+        assert sorted(convention) == list(range(rules.m)) and 0 <= cue < rules.m
+        # every other time what the leader will do, so that rewards are not rare
+        action = int(convention[cue]) if age % 2 else int(generator.integers(rules.m))
+        obs, rewards, terminations, truncations, infos = env.step({"follower": action})
+        counts = rules.rewarded == "always" or age % life >= life - rules.rollout_steps
+        assert rewards == {"follower": float(counts and action == convention[cue])}
+        assert env.scripted_actions() == {"leader": convention[cue]}
+        assert terminations == {"follower": False} and infos == {"follower": {}}
+        over = age % rules.rollout_steps == rules.rollout_steps - 1
+        assert truncations == {"follower": over} and env.agents == ([] if over else ["follower"])
+        n_rewarded += rewards["follower"] > 0
+        if not np.array_equal(env.convention, convention):
+            assert rules.K is not None and (age + 1) % life == 0
+            n_switches += 1
+        if over:
+            obs, _ = env.reset()
+    assert n_rewarded > 0
+    assert (n_switches > 0) == (rules.K is not None)
+
+
+@pytest.mark.parametrize("env_name", ["convention-swap", SwitchingConvention])
+@pytest.mark.parametrize("kwargs", [{"m": 3, "K": 2, "rollout_steps": 4}, {"m": 3, "K": 1, "rollout_steps": 3, "seed": 2}])
+@pytest.mark.parametrize("leader_visible", [True, False])
+def test_the_followers_history_pairs_cues_with_what_the_leader_did_at_them(env_name, kwargs, leader_visible):
+    env = make_team_env(env_name, 2, seed=0, env_kwargs={**kwargs, "leader_visible": leader_visible})
+    hub = Lockstep(env)
+    assert hub.agent_envs["follower"].get_attr("others_action_spaces") == [{"leader": spaces.Discrete(3)}] * 2
+    obs = env.reset()["follower"]
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        played = [int(convention[cue]) for convention, cue in zip(env.get_attr("convention"), obs, strict=True)]
+        actions = {"follower": generator.integers(3, size=2)}
+        (part,) = hub._views.split(actions, env.step(actions))
+        for i in range(2):
+            expected = np.eye(3)[played[i]] if leader_visible else np.zeros(3)
+            assert part[3][i]["others_actions"].tolist() == expected.tolist()
+            assert part[3][i]["others_visible"].tolist() == [leader_visible]
+            assert part[1][i] == (actions["follower"][i] == played[i])
+        obs = part[0]
+    env.close()
+
+
+def test_the_sequence_of_conventions_is_one_of_the_seed():
+    first = conventions(50, seed=7)
+    assert all(np.array_equal(a, b) for a, b in zip(first, conventions(50, K=3, rollout_steps=2, seed=7), strict=True))
+    other = conventions(50, seed=8)
+    assert sum(np.array_equal(a, b) for a, b in zip(first, other, strict=True)) < 12
+    assert len({tuple(c) for c in conventions(9, K=None, seed=7)}) == 1
+    assert np.array_equal(conventions(1, K=None, seed=7)[0], first[0])
+    # the cues' seed has no say in it
+    env = SwitchingConvention(K=2, rollout_steps=2, seed=7)
+    for seed in (0, 7, 12):
+        env.reset(seed=seed)
+        assert np.array_equal(env.convention, first[0])
+
+
+def test_conventions_are_uniformly_drawn():
+    drawn = np.array(conventions(600, m=3))
+    _, counts = np.unique(drawn, axis=0, return_counts=True)
+    assert len(counts) == 6
+    # the 99.9 % point of chi-squared with 5 degrees of freedom
+    assert ((counts - 100) ** 2 / 100).sum() < 20.5
+    # one says nothing of the next
+    again = (drawn[1:] == drawn[:-1]).all(axis=1).mean()
+    assert abs(again - 1 / 6) < 0.05
+
+
+def test_cues_are_uniform():
+    env = SwitchingConventionVecEnv(64, m=4)
+    env.seed(0)
+    env.reset()
+    cues = [env.step({"follower": np.zeros(64, int)})[0]["follower"] for _ in range(100)]
+    counts = np.bincount(np.concatenate(cues), minlength=4)
+    assert (np.abs(counts - 1600) < 4 * np.sqrt(1600 * 0.75)).all()
+
+
+def test_copies_meet_the_same_conventions_with_cues_of_their_own():
+    env = SwitchingConventionVecEnv(5, K=2, rollout_steps=3, seed=4)
+    env.seed(0)
+    cues, switches = [env.reset()["follower"]], 0
+    for _ in range(30):
+        before = env.get_attr("convention")
+        assert all(np.array_equal(convention, before[0]) for convention in before)
+        cues.append(env.step({"follower": np.zeros(5, int)})[0]["follower"])
+        switches += not np.array_equal(before[0], env.get_attr("convention", [3])[0])
+    assert 3 <= switches <= 5
+    assert len(np.unique(np.array(cues), axis=1).T) == 5
+
+
+def test_a_reset_with_a_seed_begins_life_anew_and_one_without_goes_on():
+    def play(env, n_steps):
+        record = []
+        for _ in range(n_steps):
+            obs, rewards, *_ = env.step({"follower": 1})
+            record.append((obs, rewards, env.scripted_actions(), env.convention.tolist()))
+            if not env.agents:
+                record.append(env.reset())
+        return record
+
+    env = SwitchingConvention(K=2, rollout_steps=4, seed=5)
+    first = [env.reset(seed=1), *play(env, 19)]
+    assert [env.reset(seed=1), *play(env, 19)] == first
+    assert [env.reset(seed=2), *play(env, 19)] != first
+    # 3 of the 8 steps of the first convention, and a reset in the middle of an episode
+    env.reset(seed=1)
+    start = env.convention
+    play(env, 3)
+    env.reset()
+    assert np.array_equal(env.convention, start)
+    ages = []
+    for age in range(4, 9):
+        play(env, 1)
+        ages.append((age, np.array_equal(env.convention, start)))
+    assert ages == [(4, True), (5, True), (6, True), (7, True), (8, False)]
+
+
+@pytest.mark.parametrize("kwargs", VARIANTS)
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_batch_equals_single_copies_bit_for_bit(kwargs, n_envs):
+    env = SwitchingConventionVecEnv(n_envs, **kwargs)
+    singles = [SwitchingConvention(**kwargs) for _ in range(n_envs)]
+    env.seed(7)
+    first = env.reset()["follower"]
+    assert first.dtype == np.int64
+    assert first.tolist() == [single.reset(seed=7 + i)[0]["follower"] for i, single in enumerate(singles)]
+    generator = np.random.default_rng(0)
+    length = env.config.rollout_steps
+    for t in range(60):
+        actions = generator.integers(env.config.m, size=n_envs)
+        obs, rewards, dones, infos = env.step({"follower": actions})
+        assert rewards.dtype == np.float32 and obs["follower"].dtype == np.int64
+        for i, single in enumerate(singles):
+            single_obs, single_rewards, _, truncations, _ = single.step({"follower": int(actions[i])})
+            info = infos[i]
+            assert rewards[i] == single_rewards["follower"] and info["agent_rewards"].tolist() == [rewards[i]]
+            assert info["agent_rewards"].dtype == info["scripted_actions"].dtype == np.float32
+            leader = single.scripted_action_spaces["leader"]
+            np.testing.assert_array_equal(
+                info["scripted_actions"], spaces.flatten(leader, single.scripted_actions()["leader"])
+            )
+            assert info["visible"].tolist() == [single.visibility()["follower"].tolist()]
+            assert info["active"].tolist() == [True] and info["life_end"].tolist() == [False]
+            assert info["truncated"].tolist() == [dones[i]] == [truncations["follower"]]
+            if dones[i]:
+                assert (t + 1) % length == 0 and info["episode"]["l"] == length
+                assert info["TimeLimit.truncated"] is True
+                assert info["terminal_observation"] == single_obs
+                single_obs = single.reset()[0]
+            else:
+                assert "terminal_observation" not in info
+            assert obs["follower"][i] == single_obs["follower"]
+            assert np.array_equal(env.get_attr("convention")[i], single.convention)
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_a_batch_equals_the_general_vectoriser(vec_env):
+    batched = make_team_env("convention-watch-act", n_envs=3, seed=2, env_kwargs={"rollout_steps": 5})
+    general = make_team_env(
+        SwitchingConvention, n_envs=3, seed=2, vec_env=vec_env, env_kwargs={"K": 2, "rewarded": "last", "rollout_steps": 5}
+    )
+    assert isinstance(batched, SwitchingConventionVecEnv) and not isinstance(general, SwitchingConventionVecEnv)
+    assert batched.scripted_action_spaces == general.scripted_action_spaces
+    np.testing.assert_array_equal(batched.reset()["follower"], general.reset()["follower"])
+    generator = np.random.default_rng(0)
+    for _ in range(23):
+        actions = {"follower": generator.integers(4, size=3)}
+        (obs, rewards, dones, infos), (obs2, rewards2, dones2, infos2) = batched.step(actions), general.step(actions)
+        np.testing.assert_array_equal(obs["follower"], obs2["follower"])
+        assert obs["follower"].dtype == obs2["follower"].dtype
+        np.testing.assert_array_equal(rewards, rewards2)
+        np.testing.assert_array_equal(dones, dones2)
+        for info, info2 in zip(infos, infos2, strict=True):
+            # worker processes say at every step that no limit was reached
+            assert info.keys() | {"TimeLimit.truncated"} == info2.keys() | {"TimeLimit.truncated"}
+            for key in info2.keys() - {"episode", "terminal_observation"}:
+                np.testing.assert_array_equal(info.get(key, False), info2[key], err_msg=key)
+            if "episode" in info:
+                assert info["episode"]["r"] == info2["episode"]["r"]
+                assert info["terminal_observation"]["follower"] == info2["terminal_observation"]["follower"]
+    general.close()
+
+
+def test_arrays_of_a_step_are_not_shared():
+    env = SwitchingConventionVecEnv(4, rollout_steps=3)
+    env.seed(0)
+    env.reset()
+    kept = [env.step({"follower": np.zeros(4, int)}) for _ in range(9)]
+    copies = pickle.loads(pickle.dumps(kept))
+    for step in kept:
+        step[1][:] += 10.0
+    for (*_, infos), (*_, infos2) in zip(kept, copies, strict=True):
+        assert all(info["agent_rewards"] == info2["agent_rewards"] for info, info2 in zip(infos, infos2, strict=True))
+
+
+class Lookup:
+    """Plays at each cue what the leader did at it in the last rollout, at random if it did not come up."""
+
+    def __init__(self, m, seed=0):
+        self.m, self.generator = m, np.random.default_rng(seed)
+        self.known: dict[int, int] = {}
+        self.rollout: dict[int, int] = {}
+
+    def act(self, env, cues):
+        guesses = self.generator.integers(self.m, size=len(cues))
+        return np.array([self.known.get(cue, guess) for cue, guess in zip(cues.tolist(), guesses, strict=True)])
+
+    def watch(self, cues, infos):
+        codes = np.array([info["scripted_actions"] for info in infos])
+        self.rollout.update(zip(cues.tolist(), codes.argmax(axis=1).tolist(), strict=True))
+
+    def rollout_ends(self):
+        self.known, self.rollout = self.rollout, {}
+
+
+class Knowing(Lookup):
+    """Knows the convention."""
+
+    def act(self, env, cues):
+        return env.game.conventions[np.arange(len(cues)), cues]
+
+
+class Constant(Lookup):
+    """Never looks."""
+
+    def act(self, env, cues):
+        return np.ones(len(cues), int)
+
+
+def rewards_by_rollout(follower, n_rollouts, **kwargs):
+    """
+    :return: mean reward of each rollout of 32 copies
+    """
+    env = SwitchingConventionVecEnv(32, **kwargs)
+    env.seed(0)
+    cues = env.reset()["follower"]
+    means = []
+    for _ in range(n_rollouts):
+        rewards = []
+        for _ in range(env.config.rollout_steps):
+            obs, reward, _, infos = env.step({"follower": follower.act(env, cues)})
+            follower.watch(cues, infos)
+            cues = obs["follower"]
+            rewards.append(reward.mean())
+        follower.rollout_ends()
+        means.append(float(np.mean(rewards)))
+    return np.array(means)
+
+
+@pytest.mark.parametrize("kwargs", [{"m": 4, "K": 5}, {"m": 3, "K": 1}, {"K": None}])
+def test_who_knows_the_convention_gets_all(kwargs):
+    assert (rewards_by_rollout(Knowing(4), 12, **kwargs) == 1.0).all()
+
+
+def test_who_never_looks_gets_one_in_m():
+    means = rewards_by_rollout(Constant(4), 400, m=4, K=1)
+    # a constant action is right at a quarter of the cues, whatever the convention
+    assert abs(means.mean() - 0.25) < 5 * means.std() / np.sqrt(len(means)) < 0.02
+
+
+@pytest.mark.parametrize("K", [2, 5])
+def test_who_looks_up_the_last_rollout_gets_the_optimum(K):
+    means = rewards_by_rollout(Lookup(4), 150 * K, m=4, K=K).reshape(-1, K)
+    # what was learned of the convention before says a little of which one it is not, and is no more right than a guess
+    first = means[:, 0]
+    assert abs(first.mean() - 0.25) < 4 * first.std() / np.sqrt(len(first)) < 0.1
+    assert (means[:, 1:] == 1.0).all()
+    assert means.mean() == pytest.approx((K - 1 + 1 / 4) / K, abs=0.1 / K)
+
+
+def test_who_looks_up_the_last_rollout_gets_all_in_the_second_of_watch_then_act():
+    means = rewards_by_rollout(Lookup(4), 40, m=4, K=2, rewarded="last").reshape(-1, 2)
+    assert (means == [0.0, 1.0]).all()
+
+
+def test_negative_control_a_new_convention_in_each_rollout():
+    means = rewards_by_rollout(Lookup(4), 400, m=4, K=1)
+    assert abs(means.mean() - 0.25) < 4 * means.std() / np.sqrt(len(means)) < 0.1
+
+
+def test_state_resumes_exactly_in_another_environment():
+    kwargs: dict[str, Any] = {"K": 2, "rollout_steps": 5, "seed": 3}
+
+    def play(env, n_steps):
+        record = []
+        for k in range(n_steps):
+            if not env.agents:
+                record.append(env.reset())
+            record.append((*env.step({"follower": k % 4}), env.scripted_actions(), env.convention.tolist()))
+        return record
+
+    for at in (0, 3, 5, 14):
+        env = SwitchingConvention(**kwargs)
+        env.reset(seed=4)
+        play(env, at)
+        state = pickle.loads(pickle.dumps(env.get_state()))
+        expected = play(env, 30)
+        other = SwitchingConvention(**kwargs)
+        other.reset(seed=99)
+        play(other, 2)
+        other.set_state(state)
+        assert play(other, 30) == expected
+    with pytest.raises(ValueError, match="with the same arguments"):
+        SwitchingConvention(m=3).set_state(state)
+
+
+def test_state_of_a_batch_resumes_exactly():
+    kwargs: dict[str, Any] = {"K": 2, "rollout_steps": 5}
+
+    def play(env, n_steps):
+        steps = [env.step({"follower": np.arange(3) % 4}) for _ in range(n_steps)]
+        # all but the wall-clock time of the monitoring, which starts anew
+        return [
+            (obs["follower"].tolist(), rewards.tolist(), dones.tolist(), [info["scripted_actions"].tolist() for info in infos])
+            for obs, rewards, dones, infos in steps
+        ]
+
+    env = SwitchingConventionVecEnv(3, **kwargs)
+    env.seed(1)
+    env.reset()
+    play(env, 13)
+    states = pickle.loads(pickle.dumps(env.get_state()))
+    cues = env.game.cue
+    expected = play(env, 40)
+    other = SwitchingConventionVecEnv(3, **kwargs)
+    other.reset()
+    assert other.set_state(states)["follower"].tolist() == cues.tolist()
+    assert play(other, 40) == expected
+    with pytest.raises(ValueError, match="2 copies for 3"):
+        other.set_state(states[:2])
+
+
+@pytest.mark.parametrize(
+    "kwargs, says",
+    [
+        ({"m": 1}, "m=1 must be an integer >= 2"),
+        ({"m": 2.0}, "m=2.0 must be an integer"),
+        ({"K": 0}, "K=0 must be an integer >= 1: for how many rollouts a convention lives, or None"),
+        ({"K": True}, "K=True must be"),
+        ({"rollout_steps": 0}, "rollout_steps=0 must be an integer >= 1"),
+        ({"rewarded": "first"}, "rewarded='first' is not one of 'always', 'last'"),
+        ({"rewarded": "last", "K": None}, "K=None would never reward.*Give K a number"),
+        ({"leader_visible": 1}, "leader_visible=1 must be True or False"),
+        ({"seed": -1}, "seed=-1 must be an integer >= 0"),
+        ({"seed": None}, "seed=None must be an integer"),
+    ],
+)
+def test_arguments_that_are_refused(kwargs, says):
+    with pytest.raises(ValueError, match=says):
+        SwitchingConvention(**kwargs)
+    with pytest.raises(ValueError, match=says):
+        SwitchingConventionVecEnv(2, **kwargs)
+
+
+def test_wrong_use():
+    env = SwitchingConvention(rollout_steps=1)
+    with pytest.raises(ValueError, match="call reset"):
+        env.step({"follower": 0})
+    env.reset()
+    with pytest.raises(ValueError, match="No action for 'follower'"):
+        env.step({"leader": 0})
+    wrong: list[Any] = [4, -1, 0.5]
+    for action in wrong:
+        with pytest.raises(ValueError, match="allowed are the integers 0 to 3"):
+            env.step({"follower": action})
+    numpy_integer: Any = np.int64(3)
+    env.step({"follower": numpy_integer})
+    with pytest.raises(ValueError, match="call reset"):
+        env.step({"follower": 0})
+    with pytest.raises(ValueError, match="num_envs=0"):
+        SwitchingConventionVecEnv(0)
+    batched = SwitchingConventionVecEnv(2)
+    batched.reset()
+    for actions in (np.array([0, 4]), np.array([-1, 0]), np.array([0.0, 1.0])):
+        with pytest.raises(ValueError, match="integers from 0 to 3"):
+            batched.step({"follower": actions})
+
+
+def test_ids():
+    for env_id, K, rewarded in (
+        ("convention-swap", 2, "always"),
+        ("convention-watch-act", 2, "last"),
+        ("convention-redraw", 5, "always"),
+    ):
+        single, batched = make_parallel_env(env_id, m=3), make_batched_env(env_id, 2, m=3)
+        assert isinstance(single, SwitchingConvention) and isinstance(batched, SwitchingConventionVecEnv)
+        assert single.config == batched.config
+        assert (single.config.m, single.config.K, single.config.rewarded) == (3, K, rewarded)
+
+
+def test_a_follower_learns_what_the_leader_does():
+    env = make_team_env("convention-swap", n_envs=4, env_kwargs={"rollout_steps": 8})
+    policy_kwargs: dict[str, Any] = {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4}
+    small: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "history_length": 32, "device": "cpu"}
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, policy_kwargs=policy_kwargs, **small).learn(96)
+    model: Any = team.agents["follower"]
+    # the third rollout: the second convention in full, told at every step
+    (second,) = {tuple(row) for row in env.get_attr("convention")}
+    buffer = model.rollout_buffer
+    played = np.array(second)[buffer.observations.astype(int).ravel()]
+    np.testing.assert_array_equal(buffer.others_actions.argmax(axis=-1).ravel(), played)
+    assert buffer.others_visible.all()
