@@ -121,7 +121,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         if self.belief == "none":
             return
         found = others_of(env)
-        if found != self.others_action_spaces:
+        if list(found.items()) != list(self.others_action_spaces.items()):
             raise ValueError(
                 f"the others of this environment are {found}, but the model has been made for {self.others_action_spaces}; "
                 "a belief is about these others with these action spaces, in this order"

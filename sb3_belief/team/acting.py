@@ -21,7 +21,8 @@ class Actor:
 
     def __init__(self, model: BaseAlgorithm, statistics: VecNormalize | None):
         self._model, self._statistics = model, statistics
-        self._takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+        #: Whether the model's ``predict`` takes action masks
+        self.takes_masks = "action_masks" in inspect.signature(model.predict).parameters
         self._state: PolicyState = None
 
     def predict(
@@ -42,7 +43,7 @@ class Actor:
         """
         if self._statistics is not None:
             obs = self._statistics.normalize_obs(obs)  # type: ignore[assignment]
-        kwargs: dict[str, Any] = {} if masks is None or not self._takes_masks else {"action_masks": masks}
+        kwargs: dict[str, Any] = {} if masks is None or not self.takes_masks else {"action_masks": masks}
         return self._model.predict(obs, state, episode_start, deterministic, **kwargs)
 
     def go_on(self, obs: np.ndarray, episode_start: np.ndarray, masks: np.ndarray | None) -> np.ndarray:

@@ -87,6 +87,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
         return self.venv.get_images()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        if attr_name == "action_masks":
+            return super().get_attr(attr_name, indices)
         return self.venv.get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -95,6 +97,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
+        if method_name == "action_masks":
+            return super().env_method(method_name, indices=indices)
         return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
     def _reset_joint(self) -> TeamObs:

@@ -5,7 +5,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -225,20 +225,23 @@ class Team:
         state: dict[str, PolicyState] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-        action_masks: Mapping[str, np.ndarray] | None = None,
+        action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None = None,
     ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
         """
         :param observation: {agent: array [n_envs, ...]}, or {agent: one observation}; normalised here if the team normalises
         :param state: recurrent states as returned by the last call, None at first
         :param episode_start: bool [n_envs]: where recurrent states start anew
         :param deterministic: the most likely actions instead of samples
-        :param action_masks: {agent: bool [n_envs, k]} for models that take masks (``env.action_masks()``)
+        :param action_masks: {agent: bool [n_envs, k]} for models that take masks (``env.action_masks()``); or a dict of each
+            copy's masks, as sb3-contrib's ``MaskableEvalCallback`` and ``evaluate_policy`` get them from the environment
         :return: {agent: action(s)} and the recurrent states (None if no agent has any)
         :raises ValueError: if an agent's observation is missing
         """
         missing = [agent for agent in self.possible_agents if agent not in observation]
         if missing:
             raise ValueError(f"No observation for {missing}; a team predicts from {{agent: observation}} of all its agents.")
+        if action_masks is not None and not isinstance(action_masks, Mapping):
+            action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
         actions: TeamObs = {}
         states: dict[str, PolicyState] = {}
         for agent in self.possible_agents:
@@ -250,6 +253,11 @@ class Team:
                 None if action_masks is None else action_masks.get(agent),
             )
         return actions, states if any(s is not None for s in states.values()) else None
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether an agent's model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
+        return any(self._roster.actor(agent).takes_masks for agent in self.possible_agents)
 
     def save(self, path: str | os.PathLike | io.BufferedIOBase) -> None:
         """

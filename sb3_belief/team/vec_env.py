@@ -164,6 +164,9 @@ class TeamVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         result = getattr(self, method_name)(*method_args, **method_kwargs)
+        if method_name == "action_masks":
+            # sb3-contrib's evaluation asks each copy for its masks, and hands what it got to predict()
+            return [{agent: masks[i] for agent, masks in (result or {}).items()} for i in self._get_indices(indices)]
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:

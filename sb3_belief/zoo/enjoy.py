@@ -107,7 +107,14 @@ def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
     algo, env_id, conf_file = run
     config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=options.extra_packages)
     render_mode = "human" if options.output is None else "rgb_array"
-    return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode})
+    env = make_parallel_env(config.env_id, **config.env_kwargs)
+    has_pictures = render_mode in env.metadata.get("render_modes", [])
+    env.close()
+    if has_pictures:
+        return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode})
+    if options.output is not None:
+        raise ConfigError(f"enjoy: {config.env_id} has no pictures to write to {options.output!r}; leave out --output.")
+    return config
 
 
 def _make_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:

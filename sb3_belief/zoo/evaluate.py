@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief.team import TeamVecEnv
@@ -46,7 +47,9 @@ def evaluate(player: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool 
         if locals_["done"] and "is_success" in locals_["info"]:
             successes.append(bool(locals_["info"]["is_success"]))
 
-    returns, _ = evaluate_policy(
+    # The environment's masks hold wherever a model takes them
+    run = evaluate_masked if getattr(player, "takes_masks", False) else evaluate_policy
+    returns, _ = run(
         player, env, n_eval_episodes=n_episodes, deterministic=deterministic, callback=note, return_episode_rewards=True
     )
     return Outcome(np.asarray(returns, dtype=float), np.asarray(successes, dtype=bool))

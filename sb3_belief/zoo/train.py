@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
@@ -114,7 +115,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         env.start_monitor(str(folder))
         if options.verbose:
             print(f"Run folder: {folder}  (seed {seed})")
-        return _learn(team, config, options, folder, record, _callbacks(config, options, folder, eval_env))
+        return _learn(team, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
 
 
 def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
@@ -179,7 +180,9 @@ def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, com
     return team
 
 
-def _callbacks(config: RunConfig, options: TrainOptions, folder: Path, eval_env: TeamVecEnv | None) -> list[BaseCallback]:
+def _callbacks(
+    team: Team, config: RunConfig, options: TrainOptions, folder: Path, eval_env: TeamVecEnv | None
+) -> list[BaseCallback]:
     callbacks: list[BaseCallback] = [callback(**kwargs) for callback, kwargs in config.callbacks]
     # SB3's callbacks count calls, which come once per step of all the copies together
     if options.save_freq > 0:
@@ -189,7 +192,7 @@ def _callbacks(config: RunConfig, options: TrainOptions, folder: Path, eval_env:
         # Training in worker processes, evaluation in this one: intended
         warnings.filterwarnings("ignore", message="Training and eval env are not of the same type")
         callbacks.append(
-            EvalCallback(
+            (MaskableEvalCallback if team.takes_masks else EvalCallback)(
                 eval_env,
                 n_eval_episodes=options.eval_episodes,
                 eval_freq=max(options.eval_freq // config.n_envs, 1),

@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 import torch as th
 from mpe2 import simple_spread_v3
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_belief import MaskableBeliefPPO
 from sb3_belief.team.roster import agent_seed
+from sb3_belief.zoo.evaluate import evaluate
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
-from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv, ToySolo
+from tests.team.toy_envs import MaskedEnv, MixedEnv, ScriptedEnv, ToyEnv, ToySolo
 
 
 def learned(vec_env="dummy", seed=3):
@@ -262,19 +266,22 @@ def test_dying_agents_learn_on():
     assert [len(kept["infos"][0]["others_actions"]) for kept in record.kept[:1]] == [6]
 
 
-def test_masks_reach_maskable_ppo():
-    from sb3_contrib import MaskablePPO
-
-    from tests.team.toy_envs import MaskedEnv
-
-    env = make_team_env(partial(MaskedEnv, n_agents=3, limit=4), n_envs=2)
+@pytest.mark.parametrize("algorithm, policy", [(MaskablePPO, "MlpPolicy"), (MaskableBeliefPPO, "BeliefPolicy")])
+def test_masks_reach_rollout_and_evaluation(algorithm, policy):
+    make_env = partial(MaskedEnv, n_agents=3, limit=4)
+    env, eval_env = make_team_env(make_env, n_envs=2), make_team_env(make_env, n_envs=3)
     # MaskedEnv raises on an action that its mask forbids; agent_0 finishes first and acts on without learning
     own_kwargs = {"agent_0": {"n_steps": 6, "batch_size": 4}}
-    team = Team(MaskablePPO, "MlpPolicy", env, seed=0, agent_kwargs=own_kwargs, **PPO_KWARGS)
-    team.learn(30)
+    team = Team(algorithm, policy, env, seed=0, agent_kwargs=own_kwargs, **PPO_KWARGS)
+    assert team.takes_masks
+    callback = MaskableEvalCallback(eval_env, n_eval_episodes=6, eval_freq=8, verbose=0)
+    team.learn(30, callback=callback)
+    assert callback.n_calls > 8 and np.isfinite(callback.last_mean_reward)
     assert [model.num_timesteps for model in team.agents.values()] == [36, 32, 32]
     actions, _ = team.predict(env.reset(), action_masks=env.action_masks())
     env.step(actions)
-    plain = Team(MaskablePPO, "MlpPolicy", make_team_env(ToyEnv), seed=0, **PPO_KWARGS)
+    assert len(evaluate(team, eval_env, 6).returns) == 6
+    plain = Team(algorithm, policy, make_team_env(ToyEnv), seed=0, **PPO_KWARGS)
+    assert not Team(PPO, "MlpPolicy", env, seed=0, **PPO_KWARGS).takes_masks
     with pytest.raises(ValueError, match="does not support action masking"):
         plain.learn(8)

@@ -95,14 +95,16 @@ def test_belief_ppo_runs_in_a_checkout_that_is_elsewhere(tmp_path, monkeypatch):
     assert json.loads((folder / "run.json").read_text())["seed"] >= 0  # drawn, and written down
 
 
-@pytest.mark.parametrize("algo", ["ippo", "a2c", "dqn", "maskable_ppo", "recurrent_ppo", "trpo", "qrdqn"])
+@pytest.mark.parametrize(
+    "algo", ["ippo", "maskable_belief_ppo", "a2c", "dqn", "maskable_ppo", "recurrent_ppo", "trpo", "qrdqn"]
+)
 def test_every_algorithm_for_discrete_actions_runs_in_a_team(algo, tmp_path):
     small = ["n_envs:2", "policy_kwargs.net_arch:[8]"]
     if algo in ("dqn", "qrdqn"):
         small += ["learning_starts:8", "buffer_size:100", "batch_size:8"]
     else:
         small += ["n_steps:8"] + ([] if algo == "a2c" else ["batch_size:16"])
-    flags = ["--env", EASY, "-n", "32", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+    flags = ["--env", EASY, "-n", "32", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "16", "--eval-episodes", "2"]
     assert train_main(["--algo", algo, *flags, "-params", *small]) == 0
     team = Team.load(tmp_path / algo / f"{EASY}_1" / "team.zip")
     assert team.num_timesteps >= 32
@@ -273,6 +275,16 @@ def test_enjoy_plays_at_the_pace_of_the_environment_or_as_asked(words, fps, run,
 def test_enjoy_opens_a_window(run, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert main(["enjoy", str(run), "-n", "3"]) == 0
+
+
+def test_an_environment_without_pictures_can_be_trained_and_played(tmp_path, capsys):
+    words = ["--env", "convention-redraw", "-n", "40", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+    assert train_main([*words, "-params", "n_envs:2", "n_steps:10", "batch_size:20", "--env-kwargs", "rollout_steps:10"]) == 0
+    folder = str(tmp_path / "belief_ppo" / "convention-redraw_1")
+    assert main(["enjoy", folder, "--episodes", "2"]) == 0
+    assert capsys.readouterr().out.count("10 steps") == 2
+    assert main(["enjoy", folder, "--output", str(tmp_path / "a.gif")]) == 2
+    assert "no pictures" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,228 @@
+"""
+The games that prove a belief dynamic (sb3_belief.envs.SwitchingConvention), for all variants and seeds.
+
+    python benchmarks/games.py --jobs 2
+
+trains the YAML entries of zoo_configs/belief_ppo.yml, the same for all variants, and prints for each game and variant the
+success of every seed beside what can be had. Success is the share of steps in which the follower plays what the leader plays;
+by chance it is 1/4. `--games swap --beliefs dynamic none --seeds 0` plays a part of it.
+"""
+
+import argparse
+import itertools
+import math
+import time
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.zoo.config import load_config
+from sb3_belief.zoo.train import TrainOptions, make_env, make_team
+
+FOLLOWER = "follower"
+HISTORY = ("dynamic", "context")
+BELIEFS = (*HISTORY, "variational", "static", "wide", "none")
+# Conventions from here on are met in no training
+FRESH_SEEDS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Game:
+    """
+    :param env_id: The environment, whose YAML entry is trained
+    :param best: The best success there is
+    :param what: What is measured
+    :param beliefs: The variants that are played
+    :param rollouts: How many rollouts are trained, None for the YAML entry's
+    :param env_kwargs: What differs from the environment's id
+    """
+
+    env_id: str
+    best: float
+    what: str
+    beliefs: tuple[str, ...] = BELIEFS
+    rollouts: int | None = None
+    env_kwargs: tuple[str, ...] = ()
+
+
+GAMES = {
+    "swap": Game(
+        "convention-swap", 1.0, "T1: weights frozen, each of the 24 conventions drawn afresh and watched for 800 steps"
+    ),
+    "watch-act": Game("convention-watch-act", 1.0, "T2: second rollout of each of the last 20 conventions"),
+    "redraw": Game("convention-redraw", 0.85, "T3, K=5: all rollouts of the last 5 conventions"),
+    "redraw-each": Game("convention-redraw", 0.25, "T3, K=1, control: all rollouts", rollouts=50, env_kwargs=("K:1",)),
+    "hidden": Game(
+        "convention-swap", 0.25, "T1, control: the leader is never visible", HISTORY, 50, env_kwargs=("leader_visible:false",)
+    ),
+    "stationary": Game(
+        "convention-redraw",
+        1.0,
+        "control: the leader never changes; the last 10 rollouts",
+        ("dynamic", "none"),
+        rollouts=50,
+        env_kwargs=("K:null",),
+    ),
+}
+
+
+class Played(NamedTuple):
+    """
+    :param success: See the game
+    :param history_gain: Of the rollouts whose history is of their own convention, the mean over the last quarter of the
+        training; 0 for a belief without a history
+    :param curve: Success in each rollout of the training
+    :param seconds: CPU seconds
+    """
+
+    success: float
+    history_gain: float
+    curve: np.ndarray
+    seconds: float
+
+
+class _Record(BaseCallback):
+    """Success and history gain of each rollout."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.hits: list[float] = []
+        self.gains: list[float] = []
+
+    def _on_step(self) -> bool:
+        # Not the rewards, which do not count everywhere
+        actions, leader = self.locals["actions"], np.array([info["scripted_actions"] for info in self.locals["infos"]])
+        self.hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
+        return True
+
+    def _on_rollout_start(self) -> None:
+        # What was logged in the update before
+        model = self.model.agents[FOLLOWER]  # type: ignore[attr-defined]
+        self.gains.append(float(model.logger.name_to_value.get("belief/history_gain", 0.0)))
+
+
+def play(name: str, belief: str, seed: int, rollouts: int | None = None) -> Played:
+    """
+    :param name: A key of ``GAMES``
+    :param belief: The variant
+    :param seed: Of team, cues and conventions
+    :param rollouts: How many rollouts are trained, instead of the game's
+    :return: What came of it
+    """
+    th.set_num_threads(1)
+    start = time.process_time()
+    game = GAMES[name]
+    kwargs = [*game.env_kwargs, f"seed:{seed}"]
+    config = load_config("belief_ppo", game.env_id, params=[f"belief:{belief}"], env_kwargs=kwargs)
+    n_steps, rollouts = config.algo_kwargs["n_steps"], rollouts or game.rollouts
+    timesteps = config.n_timesteps if rollouts is None else rollouts * n_steps * config.n_envs
+    env = make_env(config, config.n_envs, seed)
+    team = make_team(config, TrainOptions(verbose=0), env, seed)
+    record = _Record()
+    team.learn(timesteps, callback=record)
+    record.on_rollout_start()
+
+    curve = np.array(record.hits).reshape(-1, n_steps).mean(axis=1)
+    n_rollouts = len(curve)
+    lifetime = env.get_attr("config")[0].K or n_rollouts
+    phase = np.arange(n_rollouts) % lifetime
+    if name in ("swap", "hidden"):
+        success = fresh_conventions(team, config.n_envs, n_steps, game.env_kwargs)
+    elif name == "watch-act":
+        success = curve[phase == 1][-20:].mean()
+    else:
+        success = curve[-{"redraw": 25, "redraw-each": 50, "stationary": 10}[name] :].mean()
+    # gains[k] was measured in the update on rollout k - 1, whose history is of the rollout before it
+    gains = np.array(record.gains[1:])
+    own = (phase > 0) & (np.arange(n_rollouts) >= 0.75 * n_rollouts)
+    gain = gains[own].mean() if own.any() else gains[-n_rollouts // 4 :].mean()
+    return Played(float(success), float(gain), curve, time.process_time() - start)
+
+
+def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterable[str]) -> float:
+    """
+    What a deployed agent does among changed teammates: it watches, and its history is all that changes.
+
+    :param team: A trained team
+    :param n_envs: Copies of the environment
+    :param n_steps: Steps of watching, and then of acting
+    :param env_kwargs: Of the game
+    :return: Success over the fresh conventions, greedy
+    """
+    model: BeliefPPO = team.agents[FOLLOWER]  # type: ignore[assignment]
+    weights = {name: value.clone() for name, value in model.policy.named_parameters()}
+    visible = "leader_visible:false" not in env_kwargs
+    hits = []
+    met: set[tuple[int, ...]] = set()
+    for seed in itertools.count(FRESH_SEEDS):
+        fresh: dict[str, Any] = {"K": None, "seed": seed, "rollout_steps": n_steps, "leader_visible": visible}
+        env = make_team_env("convention-swap", n_envs=n_envs, seed=seed, env_kwargs=fresh)
+        convention = tuple(env.get_attr("convention")[0])
+        # Each once: then no policy without a history is better at all of them together than another
+        if convention in met:
+            continue
+        met.add(convention)
+        obs = env.reset()
+        for step in range(2 * n_steps):
+            watches = step < n_steps
+            actions, _ = team.predict(obs, deterministic=not watches)
+            seen = obs
+            obs, _, _, infos = env.step(actions)
+            leader = np.array([info["scripted_actions"] for info in infos])
+            if not watches:
+                hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
+            elif model.policy.history is not None:
+                model.policy.remember(th.as_tensor(seen[FOLLOWER]), th.as_tensor(leader if visible else 0 * leader))
+        env.close()
+        if len(met) == math.factorial(len(convention)):
+            break
+    assert all(th.equal(value, weights[name]) for name, value in model.policy.named_parameters())
+    return float(np.mean(hits))
+
+
+def play_all(
+    names: Iterable[str], beliefs: Iterable[str], seeds: Iterable[int], jobs: int = 1
+) -> dict[tuple[str, str], list[Played]]:
+    """
+    :param names: Keys of ``GAMES``
+    :param beliefs: Variants, of those that each game is played with
+    :param seeds: Of the runs
+    :param jobs: Processes
+    :return: ``{(game, variant): [result of each seed]}``
+    """
+    beliefs, seeds = list(beliefs), list(seeds)
+    pairs = [(name, belief) for name in names for belief in GAMES[name].beliefs if belief in beliefs]
+    runs = [(name, belief, seed) for name, belief in pairs for seed in seeds]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        results = list(pool.map(play, *zip(*runs, strict=True)))
+    return {pair: results[i * len(seeds) : (i + 1) * len(seeds)] for i, pair in enumerate(pairs)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--games", nargs="+", default=list(GAMES), choices=list(GAMES))
+    parser.add_argument("--beliefs", nargs="+", default=list(BELIEFS), choices=BELIEFS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--jobs", type=int, default=1)
+    args = parser.parse_args()
+    total = 0.0
+    for name in args.games:
+        print(f"\n{name}: {GAMES[name].what}; the best there is: {GAMES[name].best}")
+        for (_, belief), results in play_all([name], args.beliefs, args.seeds, args.jobs).items():
+            values = "  ".join(f"{result.success:.3f}" for result in results)
+            mean, gain = np.mean([r.success for r in results]), np.mean([r.history_gain for r in results])
+            seconds = sum(result.seconds for result in results)
+            total += seconds
+            print(f"  {belief:<12} {values}   mean {mean:.3f}   history gain {gain:+.3f}   {seconds:4.0f} CPU s", flush=True)
+    print(f"\n{total / 60:.1f} CPU minutes")
+
+
+if __name__ == "__main__":
+    main()
