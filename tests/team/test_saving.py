@@ -7,12 +7,17 @@ import sys
 import zipfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from mpe2 import simple_spread_v3
 from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_belief import BeliefPPO
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ToyEnv
 
@@ -81,6 +86,34 @@ def test_round_trip(tmp_path, normalize):
         before = parameters(loaded.agents["agent_1"])
         loaded.learn(24, reset_num_timesteps=False)
         assert loaded.num_timesteps >= 56 and not th.equal(before, parameters(loaded.agents["agent_1"]))
+
+
+def test_an_agents_statistics_load_alone(tmp_path):
+    env = make_team_env(simple_spread_v3.parallel_env, n_envs=2, seed=0)
+    kwargs: dict[str, Any] = {"history_length": 40, **PPO_KWARGS}
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, normalize=True, **kwargs).learn(64)
+    team.save(tmp_path / "team.zip")
+    with zipfile.ZipFile(tmp_path / "team.zip") as archive:
+        archive.extractall(tmp_path)
+    alone = BeliefPPO.load(tmp_path / "agents" / "agent_0.zip")
+    own_env = DummyVecEnv([lambda: SoloEnv(alone.observation_space, alone.action_space)])
+    statistics = VecNormalize.load(str(tmp_path / "agents" / "agent_0.vecnormalize.pkl"), own_env)
+    obs = env.reset()
+    expected, _ = team.predict(obs, deterministic=True)
+    normalized = statistics.normalize_obs(obs["agent_0"])
+    assert isinstance(normalized, np.ndarray) and not np.allclose(normalized, obs["agent_0"])
+    assert alone.predict(normalized, deterministic=True)[0].tolist() == expected["agent_0"].tolist()
+    # The history holds observations as the agent saw them
+    assert alone.policy.history is not None
+    rows = alone.policy.history.filled().observations
+    assert len(rows) == 40 and rows.abs().max() <= statistics.clip_obs and rows.std(dim=0).mean() > 0.3
+
+
+class SoloEnv(gym.Env):
+    """An environment of one agent, for its spaces."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
 
 
 def test_open_files_and_classes():
