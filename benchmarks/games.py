@@ -176,10 +176,10 @@ def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterabl
             seen = obs
             obs, _, _, infos = env.step(actions)
             leader = np.array([info["scripted_actions"] for info in infos])
-            if not watches:
+            if watches:
+                model.policy.remember(seen[FOLLOWER], leader if visible else 0 * leader)
+            else:
                 hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
-            elif model.policy.history is not None:
-                model.policy.remember(th.as_tensor(seen[FOLLOWER]), th.as_tensor(leader if visible else 0 * leader))
         env.close()
         if len(met) == math.factorial(len(convention)):
             break

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import asdict, fields
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -10,7 +11,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_kept
@@ -56,12 +57,12 @@ class BeliefAlgorithmMixin(_Algorithm):
         for name, value in asdict(options).items():
             setattr(self, name, value)
         for name, coefficient in (("action_coef", action_coef), ("kl_coef", kl_coef)):
-            if not callable(coefficient) and not isinstance(coefficient, (float, int)):
+            if not callable(coefficient) and not isinstance(coefficient, Real):
                 raise TypeError(f"{name} is {coefficient!r}; it must be a number of at least 0, or a schedule of such numbers")
             if not callable(coefficient) and coefficient < 0:
                 raise ValueError(f"{name} is {coefficient!r}; the weight of a loss must be at least 0")
-        self.action_coef = action_coef
-        self.kl_coef = kl_coef
+        self.action_coef = action_coef if callable(action_coef) else float(action_coef)
+        self.kl_coef = kl_coef if callable(kl_coef) else float(kl_coef)
         # Whoever holds no belief about the others may meet any
         self.others_action_spaces = {} if self.env is None or options.variant is None else others_of(self.env)
 
@@ -170,7 +171,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         finally:
             buffer.on_minibatch = None
             policy.stage(None)
-        policy.remember(obs_as_tensor(observations, self.device), th.as_tensor(actions, device=self.device))
+        policy.remember(observations, actions)
 
     def _coefficient(self, name: str) -> float:
         """The weight of a loss at this time of the training."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -121,13 +122,15 @@ class BeliefBufferMixin(_Buffer):
             raise RuntimeError("recent() must be called before the first get() of an update: that reorders the rows")
         rows = np.flatnonzero(self.active.reshape(-1))[-n_rows:]
 
-        def pick(array: np.ndarray) -> np.ndarray:
-            return array.reshape(-1, *array.shape[2:])[rows]
+        def pick(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+            # As the environment gives them: SB3 keeps a Discrete observation as an array of one number
+            return array.reshape(-1, *array.shape[2:])[rows].reshape(len(rows), *shape)
 
-        observations = self.observations
-        if isinstance(observations, dict):
-            return {key: pick(part) for key, part in observations.items()}, pick(self.others_actions)
-        return pick(observations), pick(self.others_actions)
+        actions = pick(self.others_actions, self.others_actions.shape[2:])
+        observations, space = self.observations, self.observation_space
+        if isinstance(observations, dict) and isinstance(space, spaces.Dict):
+            return {key: pick(part, space[key].shape or ()) for key, part in observations.items()}, actions
+        return pick(observations, space.shape or ()), actions
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """

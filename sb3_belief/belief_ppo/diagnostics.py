@@ -84,7 +84,8 @@ def _first_log_ratio(
     observations: th.Tensor | dict[str, th.Tensor],
     minibatch: BeliefMinibatch,
 ) -> float:
-    actions = buffer.to_torch(buffer.actions[step])
+    # As SB3's _get_samples: MultiBinary's are kept as int8, for which torch has no likelihood
+    actions = buffer.to_torch(buffer.actions[step].astype(np.float32, copy=False))
     if isinstance(policy.action_space, spaces.Discrete):
         actions = actions.long().flatten()
     masks = {}

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from numbers import Integral
 
 from sb3_belief.belief import ACTION_LOSSES, SIMILARITIES, VARIANTS, ActionLayout, Variant
 
@@ -34,7 +35,7 @@ class BeliefOptions:
         _check_choice("action_loss", self.action_loss, ACTION_LOSSES)
         _check_choice("policy_latent", self.policy_latent, POLICY_LATENTS)
         _check_choice("similarity", self.similarity, SIMILARITIES)
-        if not isinstance(self.history_length, int) or self.history_length < 1:
+        if not isinstance(self.history_length, Integral) or self.history_length < 1:
             raise ValueError(
                 f"history_length is {self.history_length!r}; it must be an integer of at least 1, so that there is a row to "
                 "attend to (the paper uses 800). For a belief without a history use belief='variational' or 'static'."

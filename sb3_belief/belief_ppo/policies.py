@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -78,7 +79,7 @@ class BeliefPolicyMixin(_Policy):
         # All this before SB3's constructor, which builds the networks
         self.options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
-            if not isinstance(width, int) or width < 1:
+            if not isinstance(width, Integral) or width < 1:
                 raise ValueError(f"{name} is {width!r}; it must be an integer of at least 1")
         self.others_action_spaces = dict(others_action_spaces or {})
         self.embedding_dim = embedding_dim
@@ -107,7 +108,7 @@ class BeliefPolicyMixin(_Policy):
         features = super().make_features_extractor()
         if not self.has_belief:
             return features
-        # A belief must not shift the random stream from which SB3 draws the other weights
+        # A stream aside: with the same seed, all variants of a belief begin with the same weights beside it
         with th.random.fork_rng(devices=[]):
             belief = DynamicBelief(
                 get_flattened_obs_dim(self.observation_space),
@@ -169,14 +170,26 @@ class BeliefPolicyMixin(_Policy):
         """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
 
-    def remember(self, observations: PyTorchObs, actions: th.Tensor) -> None:
+    def remember(self, observations: np.ndarray | dict[str, np.ndarray], actions: np.ndarray) -> None:
         """
-        Append the agent's own active steps to its history.
+        Append the agent's own active steps to its history: all that an agent needs to adapt to other teammates. The algorithm
+        does so after each update; where an agent is deployed, its user does. A belief without a history remembers nothing.
 
-        :param observations: Its observations, as the environment gives them, oldest first
+        :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
         :param actions: The others' flattened actions at these steps, ``[N, W]``, zero where not visible
+        :raises ValueError: if the actions are not of this shape
         """
-        self._extractor.remember(self.flat_observations(observations), actions)
+        if self.history is None:
+            return
+        # Images with the channels last come as the environment gives them, too
+        rows = self.flat_observations(self.obs_to_tensor(observations)[0])
+        if actions.shape != (len(rows), self.layout.width):
+            raise ValueError(
+                f"the others' actions have the shape {actions.shape}; {len(rows)} steps beside "
+                f"{', '.join(self.others_action_spaces)} need {(len(rows), self.layout.width)}, coded as in the environment's "
+                "info['others_actions']: one-hot for Discrete and each dimension of MultiDiscrete, else the values"
+            )
+        self._extractor.remember(rows, th.as_tensor(actions, device=self.device))
 
     def stage(self, minibatch: BeliefMinibatch | None) -> None:
         """

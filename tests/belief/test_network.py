@@ -1,79 +1,20 @@
-"""The network against an independent computation, written from the paper in numpy (eq. 3 to 7)."""
+"""The belief network's parts; its numbers are compared with the equations in tests/equations."""
 
-import numpy as np
 import pytest
 import torch as th
 
-from sb3_belief.belief import ActionLayout, DynamicBelief, History, append_rows, empty_history, kl_divergence, squared_error
+from sb3_belief.belief import VARIANTS, DynamicBelief, History, empty_history, n_kept
 
 D_O, W, D, Z = 6, 5, 8, 4
 
 
-def weights_of(net: DynamicBelief) -> dict[str, np.ndarray]:
-    return {name: value.detach().numpy().astype(np.float64) for name, value in net.named_parameters()}
-
-
-def linear(p: dict[str, np.ndarray], name: str, x: np.ndarray) -> np.ndarray:
-    return x @ p[f"{name}.weight"].T + p.get(f"{name}.bias", np.zeros(1))
-
-
-def reference_belief(net, observation, history_observations, history_actions, noise, n_kept):
-    """One observation's belief, in double precision and plain loops."""
-    p = weights_of(net)
-
-    def embed(o):
-        return linear(p, "observation_embedding.2", np.maximum(linear(p, "observation_embedding.0", o), 0))
-
-    e = embed(observation)
-    context = e.copy()
-    kept = []
-    if len(history_observations):
-        embedded = [embed(o) for o in history_observations]
-        cosine = [e @ h / (np.linalg.norm(e) * np.linalg.norm(h)) for h in embedded]
-        kept = sorted(np.argsort(cosine)[::-1][:n_kept])
-        states = [embedded[i] + linear(p, "action_embedding", history_actions[i]) for i in kept]
-        scores = np.array([linear(p, "query", e) @ linear(p, "key", s) for s in states]) / np.sqrt(D)
-        attention = np.exp(scores - scores.max())
-        attention /= attention.sum()
-        for weight, state in zip(attention, states, strict=True):
-            context += weight * linear(p, "value", state)
-    mean, log_std = np.split(linear(p, "encoder", context), 2)
-    log_std = np.clip(log_std, -5, 2)
-    latent = mean if noise is None else mean + np.exp(log_std) * noise
-    return latent, mean, log_std, linear(p, "decoder", latent), kept
-
-
-@pytest.mark.parametrize("n_filled", [0, 1, 7, 60])
-@pytest.mark.parametrize("keep_ratio", [0.05, 0.5, 1.0])
-@pytest.mark.parametrize("with_noise", [False, True])
-def test_equals_the_equations(n_filled, keep_ratio, with_noise):
-    th.manual_seed(n_filled)
-    net = DynamicBelief(D_O, W, D, Z, keep_ratio)
-    history = append_rows(empty_history(60, D_O, W), th.randn(n_filled, D_O), th.randn(n_filled, W))
-    observations = th.randn(9, D_O)
-    noise = th.randn(9, Z) if with_noise else None
-    output = net(observations, history, noise)
-    n_kept = min(n_filled, max(1, round(keep_ratio * n_filled)))
-    assert output.kept.shape == (9, n_kept)
-    for row in range(9):
-        latent, mean, log_std, prediction, kept = reference_belief(
-            net,
-            observations[row].numpy(),
-            history.observations[:n_filled].numpy(),
-            history.actions[:n_filled].numpy(),
-            None if noise is None else noise[row].numpy(),
-            n_kept,
-        )
-        assert sorted(output.kept[row].tolist()) == kept
-        for name, expected in dict(latent=latent, mean=mean, log_std=log_std, prediction=prediction).items():
-            np.testing.assert_allclose(getattr(output, name)[row].detach().numpy(), expected, atol=1e-5)
-    if n_kept:
-        np.testing.assert_allclose(output.weights.detach().sum(dim=1).numpy(), 1, atol=1e-6)
+def random_history(length: int = 40) -> History:
+    return History(th.randn(length, D_O), th.randn(length, W), th.ones(length, dtype=th.bool))
 
 
 def test_rows_can_be_selected_beforehand():
     net = DynamicBelief(D_O, W, D, Z, 0.1)
-    history = History(th.randn(40, D_O), th.randn(40, W), th.ones(40, dtype=th.bool))
+    history = random_history()
     observations = th.randn(5, D_O)
     free = net(observations, history)
     again = net(observations, history, kept=free.kept, context=net.encode_history(history))
@@ -82,57 +23,80 @@ def test_rows_can_be_selected_beforehand():
     assert (other.latent - free.latent).abs().max() > 1e-3
 
 
-def test_losses_equal_the_equations():
-    th.manual_seed(0)
-    layout = ActionLayout([[3], [2]], ["categorical", "number"])
-    assert layout.owners == [0, 0, 0, 1, 1] and layout.blocks == [(0, 0, 3)]
-    prediction, actions = th.randn(6, 5), th.randn(6, 5)
-    visible = th.rand(6, 2) < 0.5
-    expected, count = 0.0, 0
-    for b in range(6):
-        for other, columns in enumerate([[0, 1, 2], [3, 4]]):
-            if visible[b, other]:
-                expected += sum(float(actions[b, c] - prediction[b, c]) ** 2 for c in columns)
-                count += 1
-    result = squared_error(prediction, actions, visible, layout)
-    assert count > 2 and result.item() == pytest.approx(expected / count, rel=1e-5)
-    nobody = th.zeros(6, 2, dtype=th.bool)
-    assert squared_error(prediction, actions, nobody, layout).item() == 0
-
-    mean, log_std = th.randn(6, Z), 0.3 * th.randn(6, Z)
-    normal = th.distributions.Normal
-    expected_kl = th.distributions.kl_divergence(normal(mean, log_std.exp()), normal(th.zeros(6, Z), th.ones(6, Z)))
-    assert kl_divergence(mean, log_std).item() == pytest.approx(expected_kl.sum(1).mean().item(), rel=1e-5)
-
-
-def test_gradient_of_the_loss_reaches_every_module():
+def test_more_rows_than_there_are_cannot_be_kept():
     net = DynamicBelief(D_O, W, D, Z)
-    history = History(th.randn(100, D_O), th.randn(100, W), th.ones(100, dtype=th.bool))
-    output = net(th.randn(8, D_O), history, th.randn(8, Z))
-    visible = th.ones(8, 1, dtype=th.bool)
-    loss = squared_error(output.prediction, th.randn(8, W), visible, ActionLayout([[W]], ["number"]))
-    (loss + kl_divergence(output.mean, output.log_std)).backward()
-    for name, parameter in net.named_parameters():
-        assert parameter.grad is not None and parameter.grad.abs().max() > 0, name
+    with pytest.raises(ValueError, match="3 rows are to be kept of a history of 2"):
+        net(th.randn(1, D_O), random_history(2), kept=th.zeros(1, 3, dtype=th.long))
 
 
-def test_history_keeps_the_newest_rows_in_order():
-    history = empty_history(5, 1, 1)
-    assert not history.valid.any() and len(history.filled().observations) == 0
-    rows = th.arange(8.0).unsqueeze(1)
-    first = append_rows(history, rows[:3], -rows[:3])
-    assert first.valid.tolist() == [True, True, True, False, False]
-    assert first.filled().observations.flatten().tolist() == [0, 1, 2]
-    second = append_rows(first, rows[3:], -rows[3:])
-    assert second.observations.flatten().tolist() == [3, 4, 5, 6, 7] and second.valid.all()
-    assert second.actions.flatten().tolist() == [-3, -4, -5, -6, -7]
-    third = append_rows(first, rows[3:6], -rows[3:6])
-    assert third.observations.flatten().tolist() == [1, 2, 3, 4, 5]
-    assert first.filled().observations.flatten().tolist() == [0, 1, 2]
+@pytest.mark.parametrize("keep_ratio", [0.01, 0.05, 0.5, 1.0])
+def test_at_least_one_row_is_kept_and_at_most_all(keep_ratio):
+    for n_rows in range(1, 50):
+        assert 1 <= n_kept(keep_ratio, n_rows) <= n_rows
+    assert n_kept(keep_ratio, 0) == 0 and n_kept(keep_ratio, 1000) == 1000 * keep_ratio
 
 
-def test_layout_refuses_what_does_not_fit():
-    with pytest.raises(ValueError, match="2 others"):
-        ActionLayout([[3], [2]], ["categorical"])
-    with pytest.raises(ValueError, match="categorical, binary, number"):
-        ActionLayout([[3]], ["discrete"])
+PARTS = {
+    "dynamic": {"observation_embedding", "action_embedding", "query", "key", "value", "encoder", "decoder"},
+    "context": {"observation_embedding", "action_embedding", "query", "key", "value", "encoder", "decoder"},
+    "variational": {"observation_embedding", "encoder", "decoder"},
+    "static": {"observation_embedding", "encoder", "decoder"},
+    "wide": {"observation_embedding", "encoder"},
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_a_variant_does_not_use_is_not_built(variant):
+    net = DynamicBelief(D_O, W, D, Z, variant=variant)
+    assert {name for name, _ in net.named_children()} == PARTS[variant]
+    widths = {"dynamic": 2 * Z, "variational": 2 * Z, "context": Z, "static": Z}
+    if variant in widths:
+        assert dict(net.named_parameters())["encoder.weight"].shape == (widths[variant], D)
+    # and all that is built is used
+    output = net(th.randn(7, D_O), random_history(), th.randn(7, Z))
+    (output.latent.square().sum() + (0 if output.prediction is None else output.prediction.square().sum())).backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in net.parameters())
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_a_variant_does_not_have_does_not_matter(variant):
+    net = DynamicBelief(D_O, W, D, Z, variant=variant)
+    attends, samples, _ = VARIANTS[variant]
+    observations = th.randn(7, D_O)
+    history, noise = random_history(), th.randn(7, Z)
+    plain = net(observations, history).latent
+    assert th.equal(net(observations, history, noise).latent, plain) != samples
+    assert th.equal(net(observations, random_history()).latent, plain) != attends
+    if attends:
+        with pytest.raises(ValueError, match="empty_history"):
+            net(observations)
+        assert net(observations, empty_history(9, D_O, W)).kept.shape == (7, 0)
+    else:
+        assert th.equal(net(observations).latent, plain)
+
+
+@pytest.mark.parametrize("similarity", ["embedding", "observation"])
+def test_no_gradient_flows_through_the_choice_of_rows(similarity):
+    net = DynamicBelief(D_O, W, D, Z, 0.1, similarity=similarity)
+    observations, history = th.randn(5, D_O), random_history()
+    kept = net(observations, history).kept
+    gradients = []
+    for given in (None, kept):
+        net.zero_grad()
+        net(observations, history, kept=given).latent.sum().backward()
+        gradients.append([parameter.grad.clone() for parameter in net.parameters() if parameter.grad is not None])
+    for a, b in zip(*gradients, strict=True):
+        th.testing.assert_close(a, b)
+    assert not net.encode_history(history).directions.requires_grad
+
+
+@pytest.mark.parametrize("widths", [(64, 64), (16, 8), (8, 32), (1, 1)])
+@pytest.mark.parametrize("action_dim", [1, 5, 60])
+def test_wide_has_as_many_weights_as_dynamic(action_dim, widths):
+    embedding_dim, latent_dim = widths
+    dynamic, wide = (
+        sum(p.numel() for p in DynamicBelief(D_O, action_dim, embedding_dim, latent_dim, variant=variant).parameters())
+        for variant in ("dynamic", "wide")
+    )
+    of_a_hidden_unit = embedding_dim + 1 + latent_dim
+    assert abs(dynamic - wide) <= of_a_hidden_unit / 2

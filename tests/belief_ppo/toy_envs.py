@@ -11,10 +11,13 @@ class AmongOthers(gym.Env):
     """
     One agent among others who act at random and are visible now and then.
 
+    It is careless: it does not zero the actions of those whom the agent does not see.
+
     :param others: Their action spaces
     :param invisible_seed: Seed of the actions that the agent does not see; must change nothing for it
     :param inactive: Every how many steps the agent is out of play, 0 for never
     :param episode_length: Steps until the time limit
+    :param visible: Probability that an other is visible, of each at each step
     """
 
     def __init__(
@@ -25,19 +28,19 @@ class AmongOthers(gym.Env):
         episode_length: int = 7,
         action_space: spaces.Space | None = None,
         observation_space: spaces.Space | None = None,
+        visible: float = 0.6,
     ) -> None:
         self.others_action_spaces = {"b": spaces.Discrete(3), "c": spaces.Discrete(4)} if others is None else others
         self.observation_space = observation_space or spaces.Box(-1, 1, (5,), np.float32)
         self.action_space = action_space or spaces.Discrete(3)
-        self.inactive, self.episode_length = inactive, episode_length
+        self.inactive, self.episode_length, self.visible = inactive, episode_length, visible
         self.invisible = np.random.default_rng(invisible_seed)
 
     def _info(self) -> dict[str, Any]:
-        visible = self.np_random.random(len(self.others_action_spaces)) < 0.6
-        parts = []
+        visible = self.np_random.random(len(self.others_action_spaces)) < self.visible
+        parts = [np.zeros(0, dtype=np.float32)]
         for index, space in enumerate(self.others_action_spaces.values()):
-            shown = np.asarray(spaces.flatten(space, space_sample(space, self.np_random)), dtype=np.float32)
-            hidden = np.asarray(spaces.flatten(space, space_sample(space, self.invisible)), dtype=np.float32)
+            shown, hidden = flat_sample(space, self.np_random), flat_sample(space, self.invisible)
             parts.append(shown if visible[index] else hidden)
         active = not (self.inactive and self.steps % self.inactive == 0)
         return {"others_actions": np.concatenate(parts), "others_visible": visible, "active": active}
@@ -54,8 +57,40 @@ class AmongOthers(gym.Env):
         reward = float(self.np_random.random() + np.sum(action) / 10)
         return self.observation_space.sample(), reward, False, self.steps >= self.episode_length, self._info()
 
+    def action_masks(self) -> np.ndarray:
+        """At step t every third choice is impossible, of the binary ones every third one; only a subclass insists on it."""
+        space, possible = self.action_space, (np.arange(20) + self.steps) % 3 != 0
+        if isinstance(space, spaces.Discrete):
+            return possible[: space.n]
+        if isinstance(space, spaces.MultiDiscrete):
+            return np.concatenate([possible[:n] for n in space.nvec])
+        assert isinstance(space, spaces.MultiBinary)
+        return np.stack([np.ones(space.n, dtype=bool), possible[: space.n]], axis=1).flatten()
 
-def space_sample(space: spaces.Space, rng: np.random.Generator) -> Any:
-    """A sample of a space from a generator at hand."""
-    space.seed(int(rng.integers(2**31)))
-    return space.sample()
+
+class MaskedAmongOthers(AmongOthers):
+    """The same, where doing what is impossible is an error."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        possible, start = self.action_masks(), 0
+        for value, n in zip(np.asarray(action, dtype=int).flatten(), choices_of(self.action_space), strict=True):
+            if not possible[start + value]:
+                raise ValueError(f"{action} is impossible at step {self.steps}")
+            start += n
+        return super().step(action)
+
+
+def choices_of(space: spaces.Space) -> list[int]:
+    """How many choices there are for each component of an action."""
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    return [int(n) for n in space.nvec] if isinstance(space, spaces.MultiDiscrete) else [2] * spaces.flatdim(space)
+
+
+def flat_sample(space: spaces.Space, rng: np.random.Generator) -> np.ndarray:
+    """A flattened action of a space from a generator at hand."""
+    if isinstance(space, spaces.Box):
+        return rng.uniform(space.low, space.high).astype(np.float32).flatten()
+    if isinstance(space, spaces.MultiBinary):
+        return rng.integers(2, size=space.n).astype(np.float32)
+    return np.concatenate([np.arange(n) == rng.integers(n) for n in choices_of(space)]).astype(np.float32)

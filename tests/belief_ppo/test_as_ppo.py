@@ -1,0 +1,134 @@
+"""What Belief PPO shares with the PPO that it is made from."""
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from tests.belief_ppo.helpers import ROLLOUT, SMALL, VARIANTS, make_model
+from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
+
+
+@pytest.mark.parametrize("belief", ["none", "dynamic"])
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_without_belief_or_others_it_is_ppo(belief, env_id):
+    kwargs: dict[str, Any] = dict(n_steps=64, batch_size=32, n_epochs=3, seed=3, device="cpu")
+    ppo = PPO("MlpPolicy", env_id, **kwargs).learn(3 * 64)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ours = BeliefPPO("BeliefPolicy", env_id, belief=belief, **kwargs).learn(3 * 64)
+    expected = dict(ppo.policy.named_parameters())
+    found = dict(ours.policy.named_parameters())
+    assert expected.keys() == found.keys()
+    for name, value in expected.items():
+        assert (value - found[name]).abs().max() < 1e-6, name
+    assert sum("names no other agents" in str(w.message) for w in caught) == (belief == "dynamic")
+
+
+MASKABLE: list[spaces.Space] = [spaces.Discrete(4), spaces.MultiDiscrete([3, 2]), spaces.MultiBinary(3)]
+
+
+def of_stock_and_ours(env_kwargs, belief):
+    """MaskablePPO and ours on the same environment, after three iterations."""
+    envs = [make_vec_env(MaskedAmongOthers, n_envs=2, seed=0, env_kwargs=env_kwargs) for _ in range(2)]
+    kwargs: dict[str, Any] = dict(n_steps=12, batch_size=8, n_epochs=3, seed=3, device="cpu")
+    stock = MaskablePPO("MlpPolicy", envs[0], **kwargs).learn(3 * 24)
+    ours = MaskableBeliefPPO("BeliefPolicy", envs[1], belief=belief, **kwargs)
+    before = [parameter.detach().clone() for parameter in ours.policy.parameters()]
+    ours.learn(3 * 24)
+    assert not any(th.equal(a, b) for a, b in zip(before, ours.policy.parameters(), strict=True))
+    return dict(stock.policy.named_parameters()), dict(ours.policy.named_parameters())
+
+
+@pytest.mark.parametrize("action_space", MASKABLE, ids=lambda space: type(space).__name__)
+def test_maskable_without_belief_is_maskable_ppo(action_space):
+    expected, found = of_stock_and_ours(dict(action_space=action_space), "none")
+    assert expected.keys() == found.keys() and all(th.equal(value, found[name]) for name, value in expected.items())
+
+
+def test_maskable_without_others_is_maskable_ppo():
+    with pytest.warns(UserWarning, match="MaskableBeliefPPO is MaskablePPO here"):
+        expected, found = of_stock_and_ours(dict(others={}), "dynamic")
+    assert expected.keys() == found.keys() and all(th.equal(value, found[name]) for name, value in expected.items())
+
+
+class Solo(gym.Wrapper):
+    """Hides that there are others at all."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "others_action_spaces":
+            raise AttributeError(name)
+        return super().__getattribute__(name)
+
+    def step(self, action: Any) -> Any:
+        return *self.env.step(action)[:4], {}
+
+
+@pytest.mark.parametrize("names_nobody", [True, False])
+@pytest.mark.parametrize("belief", VARIANTS)
+def test_every_variant_is_ppo_where_there_are_no_others(belief, names_nobody):
+    def make_env():
+        return make_vec_env(lambda: AmongOthers(others={}) if names_nobody else Solo(AmongOthers(others={})), n_envs=2, seed=0)
+
+    with pytest.warns(UserWarning, match="names no other agents") as caught:
+        ours = BeliefPPO("BeliefPolicy", make_env(), belief=belief, **SMALL).learn(2 * 28)
+    assert len(caught) == 1
+    stock = {k: v for k, v in SMALL.items() if k not in ("history_length", "keep_ratio")}
+    ppo = PPO("MlpPolicy", make_env(), **stock).learn(2 * 28)
+    found = dict(ours.policy.named_parameters())
+    assert all(th.equal(value, found[name]) for name, value in ppo.policy.named_parameters())
+    assert ours.policy.belief is None and ours.policy.history is None
+    assert not any(name.startswith("belief/") for name in ours.logger.name_to_value)
+
+
+def test_none_leaves_the_belief_out_though_there_are_others():
+    model = make_model(belief="none").learn(ROLLOUT)
+    assert model.policy.belief is None and model.policy.history is None
+    assert not any("belief" in name for name, _ in model.policy.named_parameters())
+
+
+def test_the_belief_keeps_its_own_initialisation():
+    policy = make_model().policy
+    for name, value in policy.belief.named_parameters():
+        if name.endswith("weight"):  # PyTorch's default is uniform within 1/sqrt(fan_in); SB3's orthogonal one is not
+            assert value.abs().max() <= 1 / np.sqrt(value.shape[1]) + 1e-6, name
+    assert th.allclose(policy.action_net.weight @ policy.action_net.weight.T, 0.01**2 * th.eye(3), atol=1e-6)
+
+
+def test_variants_start_from_the_same_other_weights():
+    # However many weights a belief has, those that SB3 draws after it are the same at the same seed
+    policies = [make_model(belief=name).policy for name in VARIANTS]
+    others = [{name: p for name, p in policy.named_parameters() if ".belief." not in name} for policy in policies]
+    assert len({sum(p.numel() for p in policy.parameters()) for policy in policies}) > 3
+    for found in others[1:]:
+        assert len(found) > 10 and all(th.equal(value, found[name]) for name, value in others[0].items())
+
+
+@pytest.mark.parametrize("algorithm, stock", [(BeliefPPO, PPO), (MaskableBeliefPPO, MaskablePPO)])
+def test_rollout_and_update_are_sb3s_own(algorithm, stock, monkeypatch):
+    calls: list[str] = []
+
+    def counted(base: Any, name: str) -> None:
+        method = getattr(base, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            calls.append(name)
+            return method(*args, **kwargs)
+
+        monkeypatch.setattr(base, name, call)
+
+    counted(stock, "train")
+    counted(stock, "collect_rollouts")
+    make_model(algorithm=algorithm).learn(2 * ROLLOUT)
+    assert calls == ["collect_rollouts", "train"] * 2
+    ours = [base for base in algorithm.__mro__ if base.__module__.startswith("sb3_belief")]
+    assert len(ours) == 2 and not any("collect_rollouts" in vars(base) for base in ours)
+    assert "train" not in vars(algorithm)

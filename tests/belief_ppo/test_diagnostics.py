@@ -1,0 +1,84 @@
+"""What is logged of a belief."""
+
+import numpy as np
+import pytest
+
+from sb3_belief.belief_ppo import algorithm
+from tests.belief_ppo.helpers import EVERY, ROLLOUT, make_model, same_parameters
+
+ALWAYS = {"visible_fraction", "fusion_ratio", "first_log_ratio", "history_gain"}
+PREDICTING = {"action_loss", "accuracy", "base_rate"}
+NAMES = {
+    "dynamic": ALWAYS | PREDICTING | {"kl", "attention_entropy"},
+    "context": ALWAYS | PREDICTING | {"attention_entropy"},
+    "variational": ALWAYS | PREDICTING | {"kl"},
+    "static": ALWAYS | PREDICTING,
+    "wide": ALWAYS,
+    "none": set(),
+}
+
+
+def measured_of(model):
+    values = model.logger.name_to_value
+    return {name.removeprefix("belief/"): value for name, value in values.items() if name.startswith("belief/")}
+
+
+def test_diagnostics_measure_what_they_say():
+    model = make_model(history_length=400, n_steps=100, batch_size=100, learning_rate=3e-3, n_epochs=10)
+    model.learn(3 * 300)
+    measured = measured_of(model)
+    assert set(measured) == {
+        *("action_loss", "kl", "accuracy", "base_rate", "history_gain"),
+        *("attention_entropy", "fusion_ratio", "visible_fraction", "first_log_ratio"),
+    }
+    # The others act at random: 3 and 4 actions, seen six times out of ten, nothing to predict
+    assert measured["visible_fraction"] == pytest.approx(0.6, abs=0.06)
+    assert measured["base_rate"] == pytest.approx((1 / 3 + 1 / 4) / 2, abs=0.08)
+    assert measured["accuracy"] <= measured["base_rate"] + 0.08
+    assert abs(measured["history_gain"]) < 0.05
+    assert 0 < measured["attention_entropy"] <= np.log(40) + 1e-5
+    fusion = model.policy.mlp_extractor
+    belief = sum(layer.weight[:, -64:].abs().sum() for layer in (fusion.fuse_pi, fusion.fuse_vf))
+    every = sum(layer.weight.abs().sum() for layer in (fusion.fuse_pi, fusion.fuse_vf))
+    assert fusion.belief_share() == pytest.approx((belief / every).item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("kind, belief", EVERY)
+def test_each_variant_logs_what_it_has(belief, kind):
+    model = make_model(belief=belief, algorithm=kind)
+    for iteration in range(3):
+        model.learn(ROLLOUT, reset_num_timesteps=False)
+        measured = measured_of(model)
+        assert set(measured) == NAMES[belief] and all(np.isfinite(value) for value in measured.values())
+        if belief == "none":
+            continue
+        # By construction, not by luck: nothing of a history that is not there can be shuffled
+        without_history = belief not in ("dynamic", "context") or iteration == 0
+        assert (measured["history_gain"] == 0) == without_history
+        if "attention_entropy" in measured:
+            assert (measured["attention_entropy"] == 0) == (iteration == 0)
+        assert measured["first_log_ratio"] < 1e-5
+
+
+def test_the_measured_losses_are_those_that_are_trained():
+    model = make_model(n_epochs=1, batch_size=ROLLOUT, action_coef=0.25, kl_coef=0.125)
+    model.learn(ROLLOUT)
+    losses, belief_loss = [], model.policy.belief_loss
+
+    def watched(minibatch):
+        losses.append(belief_loss(minibatch))
+        return losses[-1]
+
+    model.policy.belief_loss = watched
+    model.learn(ROLLOUT)
+    measured = measured_of(model)
+    # The last one: the first is the measurement's own. 42 rows are all measured, and trained in one minibatch
+    assert losses[-1].item() == pytest.approx(0.25 * measured["action_loss"] + 0.125 * measured["kl"], rel=1e-5)
+
+
+def test_measuring_changes_nothing(monkeypatch):
+    measured = make_model().learn(3 * ROLLOUT)
+    monkeypatch.setattr(algorithm, "measure_belief", lambda policy, buffer: {})
+    unmeasured = make_model().learn(3 * ROLLOUT)
+    assert measured_of(measured) and not measured_of(unmeasured)
+    assert same_parameters(measured, unmeasured)

@@ -1,0 +1,104 @@
+"""
+Is the belief dynamic? Games whose optimum is known (docs/algorithm.md), with the settings of zoo_configs/belief_ppo.yml.
+
+The bars are those of the method's claims, not of a curve that was seen: 1/m without a history, close to the optimum with one.
+"""
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from benchmarks.games import BELIEFS, GAMES, HISTORY, Played, play, play_all
+
+SEEDS = range(5)
+CHANCE = 0.25
+Results = Callable[[str, str], list[Played]]
+
+
+def test_a_belief_follows_a_leader_whom_no_weights_can_know():
+    """The small game that guards every change: 60 of the 100 rollouts, in which each convention lives for five."""
+    dynamic, none = play("redraw", "dynamic", 0, rollouts=60), play("redraw", "none", 0, rollouts=60)
+    settled = np.arange(60) % 5 > 0
+    assert dynamic.curve[40:][settled[40:]].mean() > 0.9
+    assert dynamic.curve[~settled].mean() == pytest.approx(CHANCE, abs=0.15)  # a new convention cannot be known
+    assert none.curve[40:][settled[40:]].mean() < 0.5
+    assert dynamic.history_gain > 0.3 and none.history_gain == 0
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    """All the games that the tests below look at, two processes at a time where there are two cores."""
+    played: dict[tuple[str, str], list[Played]] = {}
+
+    def get(game: str, belief: str) -> list[Played]:
+        if (game, belief) not in played:
+            wanted = [b for b in PLAYED[game] if b in GAMES[game].beliefs]
+            played.update(play_all([game], wanted, SEEDS, jobs=os.cpu_count() or 1))
+        return played[game, belief]
+
+    return get
+
+
+PLAYED: dict[str, tuple[str, ...]] = {
+    "swap": BELIEFS,
+    "watch-act": ("dynamic", "none"),
+    "redraw": ("dynamic", "none"),
+    "redraw-each": BELIEFS,
+    "hidden": HISTORY,
+    "stationary": ("dynamic", "none"),
+}
+
+
+def mean(played: list[Played]) -> float:
+    return float(np.mean([result.success for result in played]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("belief", HISTORY)
+def test_swap_is_met_by_watching_alone(results, belief):
+    assert all(result.success >= 0.95 for result in results("swap", belief))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("belief", [belief for belief in BELIEFS if belief not in HISTORY])
+def test_swap_leaves_whoever_has_no_history_at_chance(results, belief):
+    assert mean(results("swap", belief)) == pytest.approx(CHANCE, abs=0.05)
+
+
+@pytest.mark.slow
+def test_watch_then_act(results):
+    assert all(result.success >= 0.9 for result in results("watch-act", "dynamic"))
+    assert mean(results("watch-act", "none")) == pytest.approx(CHANCE, abs=0.05)
+
+
+@pytest.mark.slow
+def test_redraw_is_close_to_the_optimum(results):
+    assert all(0.75 <= result.success <= 0.85 + 0.02 for result in results("redraw", "dynamic"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("belief", BELIEFS)
+def test_a_history_that_lags_behind_is_of_no_use(results, belief):
+    assert mean(results("redraw-each", belief)) == pytest.approx(CHANCE, abs=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("belief", HISTORY)
+def test_a_leader_who_is_never_seen_cannot_be_followed(results, belief):
+    assert mean(results("hidden", belief)) == pytest.approx(CHANCE, abs=0.05)
+    assert all(abs(result.history_gain) < 1e-6 for result in results("hidden", belief))
+
+
+@pytest.mark.slow
+def test_beside_a_stationary_leader_a_belief_does_no_harm(results):
+    dynamic, none = mean(results("stationary", "dynamic")), mean(results("stationary", "none"))
+    assert none > 0.95 and abs(dynamic - none) <= 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("game", ["swap", "watch-act", "redraw"])
+def test_the_prediction_gains_from_the_history(results, game):
+    assert all(result.history_gain > 0 for result in results(game, "dynamic"))
+    assert all(result.history_gain == 0 for result in results(game, "none"))
