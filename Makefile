@@ -6,8 +6,9 @@ STAMP := $(VENV)/.installed
 SOURCES := sb3_belief tests benchmarks train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+CONFORMANCE_ARGS ?=
 
-.PHONY: help install demo test pytest lint type format check-codestyle commit-checks clean
+.PHONY: help install demo test test-slow pytest conformance lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -27,10 +28,18 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 demo: $(STAMP)  ## train a team of BeliefPPO agents on Traffic Junction and show what it learned
 	$(BIN)/sb3-belief demo $(DEMO_ARGS)
 
-test: $(STAMP)  ## run all tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+test: $(STAMP)  ## run all tests but the slow ones
+	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(STAMP)  ## play the games that prove the belief dynamic
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 pytest: test
+
+# apart from the tests: it fetches the suites of the installed versions first
+conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our algorithms in place of theirs
+	$(BIN)/python -m tests.conformance.fetch
+	$(BIN)/python -m tests.conformance.run $(CONFORMANCE_ARGS)
 
 lint: $(STAMP)  ## look for mistakes
 	$(BIN)/ruff check $(SOURCES)

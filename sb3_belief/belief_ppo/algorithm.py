@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,7 +20,7 @@ from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.options import LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of, read_others
-from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin, fitting_extractor
 
 if TYPE_CHECKING:
     _Algorithm = OnPolicyAlgorithm
@@ -41,6 +42,7 @@ class BeliefAlgorithmMixin(_Algorithm):
 
     policy: BeliefPolicyMixin
     rollout_buffer: BeliefBufferMixin
+    normalize_advantage: bool
     others_action_spaces: ActionSpaces
     belief: str
     history_length: int
@@ -80,7 +82,7 @@ class BeliefAlgorithmMixin(_Algorithm):
                     stacklevel=3,
                 )
         if not issubclass(self.policy_class, self.policy_base):
-            raise TypeError(
+            raise ValueError(
                 f"{type(self).__name__} needs a policy with a belief, not {self.policy_class.__name__}; use 'BeliefPolicy' or "
                 f"derive yours from sb3_belief.belief_ppo.{self.policy_base.__name__}"
             )
@@ -106,6 +108,11 @@ class BeliefAlgorithmMixin(_Algorithm):
             self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs = user_kwargs
         # As SB3 does with its own coefficients that may be schedules
         self.action_coef, self.kl_coef = FloatSchedule(self.action_coef), FloatSchedule(self.kl_coef)
+
+    def _maybe_recommend_cpu(self, mlp_class_name: str = "") -> None:
+        # SB3 knows the policies without convolutions by the name of their class
+        extractor = getattr(self.policy_class, "default_extractor", None) or fitting_extractor(self.observation_space)
+        super()._maybe_recommend_cpu(self.policy_class.__name__ if extractor is FlattenExtractor else "")
 
     def _buffer_widths(self) -> dict[str, int]:
         layout, variant = action_layout(self.others_action_spaces), self._options.variant
@@ -138,7 +145,9 @@ class BeliefAlgorithmMixin(_Algorithm):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         # SB3 calls this once a step, right before it adds the step to the buffer: the place to stage the rest of the row
         super()._update_info_buffer(infos, dones)
-        active = np.array([info.get("active", True) for info in infos], dtype=bool)
+        active = np.ones(self.n_envs, dtype=bool)
+        # SB3 takes environments that return fewer infos than copies
+        active[: len(infos)] = [info.get("active", True) for info in infos]
         if not self.policy.has_belief:
             self.rollout_buffer.stage(active)
             return
@@ -154,8 +163,8 @@ class BeliefAlgorithmMixin(_Algorithm):
         steps: this rollout's, which the next rollout and its update look back on, never the one being trained on.
         """
         buffer, policy = self.rollout_buffer, self.policy
-        # A single step has no advantage statistics, and is no rollout to learn from
-        learns = buffer.active.sum() > 1
+        # A single step has no advantage statistics
+        learns = buffer.active.sum() > 1 or (buffer.active.all() and not self.normalize_advantage)
         if not policy.has_belief or not buffer.active.any():
             if learns:
                 self._update()

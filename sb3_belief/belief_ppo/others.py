@@ -62,11 +62,8 @@ def others_of(env: VecEnv) -> ActionSpaces:
     :param env: The vectorised environment of one agent
     :return: The others' action spaces in order, empty for an environment without others
     """
-    try:
-        found = env.get_attr("others_action_spaces")[0]
-    except AttributeError:
-        return {}
-    return dict(found)
+    # Asked first, because a worker process does not survive being asked for what it does not have
+    return dict(env.get_attr("others_action_spaces")[0]) if env.has_attr("others_action_spaces") else {}
 
 
 def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:

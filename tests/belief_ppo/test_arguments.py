@@ -191,7 +191,7 @@ def test_foreign_policy_and_buffer_are_refused(algorithm, buffer):
     with pytest.raises(TypeError, match=f"sb3_belief.belief_ppo.{buffer}"):
         make_model(algorithm=algorithm, rollout_buffer_class=RolloutBuffer)
     env = make_vec_env(AmongOthers, n_envs=1)
-    with pytest.raises(TypeError, match=rf"belief_ppo\.{algorithm.policy_base.__name__}"):
+    with pytest.raises(ValueError, match=rf"belief_ppo\.{algorithm.policy_base.__name__}"):
         algorithm(ActorCriticPolicy, env, **SMALL)
 
 

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from tests.belief_ppo.helpers import ROLLOUT, SMALL, VARIANTS, make_model
@@ -132,3 +133,50 @@ def test_rollout_and_update_are_sb3s_own(algorithm, stock, monkeypatch):
     ours = [base for base in algorithm.__mro__ if base.__module__.startswith("sb3_belief")]
     assert len(ours) == 2 and not any("collect_rollouts" in vars(base) for base in ours)
     assert "train" not in vars(algorithm)
+
+
+# -- what SB3 takes, ours takes too ------------------------------------------------------------------------------------
+
+
+def test_worker_processes_are_asked_for_others_without_harm():
+    with pytest.warns(UserWarning, match="names no other agents"):
+        env = make_vec_env("CartPole-v1", 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
+        model = BeliefPPO("MlpPolicy", env, n_steps=8, batch_size=16)
+    assert model.learn(16).num_timesteps == 16
+    env.close()
+
+
+class Terse(VecEnvWrapper):
+    """Says nothing in its infos, not even one for each copy."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, _ = self.venv.step_wait()
+        return obs, rewards, dones, []
+
+
+def test_infos_may_be_missing_without_others():
+    env = Terse(make_vec_env(AmongOthers, n_envs=2, seed=0, env_kwargs=dict(episode_length=1000)))
+    model = BeliefPPO("MlpPolicy", env, belief="none", n_steps=8, batch_size=16)
+    assert model.learn(16)._n_updates > 0 and model.rollout_buffer.active.all()
+
+
+def test_rollouts_of_a_single_step_train_where_advantages_are_not_normalized():
+    models = [make_model(n_envs=1, n_steps=1, batch_size=1, normalize_advantage=False, belief=b) for b in ("none", "dynamic")]
+    for model in models:
+        before = model.policy.action_net.weight.detach().clone()
+        assert not th.equal(before, model.learn(3).policy.action_net.weight)
+
+
+@pytest.mark.parametrize("algorithm", [BeliefPPO, MaskableBeliefPPO])
+@pytest.mark.parametrize("policy, warned", [("BeliefPolicy", True), ("MlpPolicy", True), ("CnnPolicy", False)])
+def test_a_gpu_is_advised_against_where_sb3_does(algorithm, policy, warned, recwarn):
+    # No GPU is needed to be asked for one
+    space = spaces.Box(0, 255, (3, 36, 36), np.uint8) if policy == "CnnPolicy" else None
+    env = make_vec_env(MaskedAmongOthers, n_envs=1, seed=0, env_kwargs=dict(observation_space=space))
+    model = algorithm(policy, env, **SMALL)
+    model.device = th.device("meta")
+    model._maybe_recommend_cpu()
+    assert any("primarily intended to run on the CPU" in str(warning.message) for warning in recwarn) == warned
