@@ -75,7 +75,9 @@ def test_watch_then_act(results):
 
 @pytest.mark.slow
 def test_redraw_is_close_to_the_optimum(results):
-    assert all(0.75 <= result.success <= 0.85 + 0.02 for result in results("redraw", "dynamic"))
+    assert all(result.success >= 0.75 for result in results("redraw", "dynamic"))
+    # Luck in the first rollouts of 25 conventions is all that may lift it above the optimum
+    assert mean(results("redraw", "dynamic")) <= GAMES["redraw"].best + 0.03
 
 
 @pytest.mark.slow
