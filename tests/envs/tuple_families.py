@@ -1,0 +1,98 @@
+"""What the tests of the Gymnasium tuple environments use."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.zoo.evaluate import evaluate
+
+SMALL: dict[str, Any] = dict(batch_size=32, n_epochs=1, history_length=32, device="cpu")
+POLICY_KWARGS: dict[str, Any] = {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4}
+
+
+def make_team(make_env: Callable[[], Any], n_steps: int, algorithm: Any = BeliefPPO, **kwargs: Any) -> Any:
+    env = make_team_env(make_env, n_envs=2, seed=0)
+    return Team(algorithm, "BeliefPolicy", env, seed=0, n_steps=n_steps, policy_kwargs=POLICY_KWARGS, **{**SMALL, **kwargs})
+
+
+def train_save_load_evaluate(make_env: Callable[[], Any], folder: Any, algorithm: Any = BeliefPPO) -> list:
+    """
+    Two short iterations, then the same team from its file.
+
+    :return: returns of two evaluation episodes
+    """
+    team = make_team(make_env, 16, algorithm)
+    before = {agent: _weights(model) for agent, model in team.agents.items()}
+    team.learn(64)
+    assert all(not th.equal(before[agent], _weights(model)) for agent, model in team.agents.items())
+    assert all(model.logger.name_to_value["belief/first_log_ratio"] < 1e-5 for model in team.agents.values())
+    team.save(folder / "team")
+    loaded = Team.load(folder / "team.zip", env=make_team_env(make_env, n_envs=2, seed=0))
+    assert all(th.equal(_weights(team.agents[agent]), _weights(model)) for agent, model in loaded.agents.items())
+    test_env: Any = make_team_env(make_env, n_envs=2, seed=9)
+    outcome = evaluate(loaded, test_env, 2)
+    loaded.learn(32)
+    return list(outcome.returns)
+
+
+def _weights(model: Any) -> th.Tensor:
+    return th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
+
+
+def check_advantages(make_env: Callable[[], Any], terminates: Callable[[np.ndarray], bool], n_steps: int) -> list[bool]:
+    """
+    Compare the advantages in all agents' rollout buffers with those computed here, from what the environment did.
+
+    :param terminates: of an episode's last observation, whether the episode terminated and was not merely cut
+    :return: for each end of an episode that was in the rollout, whether it was a termination
+    """
+    team = make_team(make_env, n_steps, gamma=0.9, gae_lambda=0.8, n_epochs=1)
+    watches = {agent: _Advantages(terminates) for agent in team.agents}
+    team.learn(2 * n_steps, agent_callbacks=watches)
+    assert all(watch.compared == 2 * n_steps for watch in watches.values())
+    return [end for watch in watches.values() for end in watch.ends]
+
+
+class _Advantages(BaseCallback):
+    def __init__(self, terminates: Callable[[np.ndarray], bool]):
+        super().__init__()
+        self.terminates = terminates
+        self.steps: list[tuple[Any, ...]] = []
+        self.ends: list[bool] = []
+        self.compared = 0
+
+    def _on_step(self) -> bool:
+        # Before SB3 adds the bootstrap values to the rewards
+        last = [info.get("terminal_observation") for info in self.locals["infos"]]
+        self.steps.append((self.locals["rewards"].copy(), self.locals["new_obs"].copy(), last))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        buffer, gamma, decay = model.rollout_buffer, model.gamma, model.gamma * model.gae_lambda
+
+        def value(observation: np.ndarray) -> float:
+            with th.no_grad():
+                return float(model.policy.predict_values(th.as_tensor(observation[None])))
+
+        for copy in range(buffer.n_envs):
+            errors, ended = [], []
+            for t, (rewards, new_obs, last) in enumerate(self.steps):
+                if last[copy] is not None:
+                    self.ends.append(self.terminates(last[copy]))
+                    following = 0.0 if self.ends[-1] else value(last[copy])
+                elif t + 1 < len(self.steps):
+                    following = buffer.values[t + 1, copy]  # a belief is sampled when acting: not what value() says
+                else:
+                    following = value(new_obs[copy])
+                errors.append(rewards[copy] + gamma * following - buffer.values[t, copy])
+                ended.append(last[copy] is not None)
+            for t in range(len(errors)):
+                stop = next((k for k in range(t, len(errors)) if ended[k]), len(errors) - 1)
+                expected = sum(decay ** (k - t) * errors[k] for k in range(t, stop + 1))
+                np.testing.assert_allclose(buffer.advantages[t, copy], expected, atol=1e-5)
+                self.compared += 1
