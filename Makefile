@@ -3,12 +3,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+SMAX_VENV ?= .venv-smax
+SMAX_STAMP := $(SMAX_VENV)/.installed
 SOURCES := sb3_belief tests benchmarks train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 CONFORMANCE_ARGS ?=
 
-.PHONY: help install demo test test-slow pytest conformance lint type format check-codestyle commit-checks clean
+.PHONY: help install demo test test-slow test-smax pytest conformance lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -41,6 +43,16 @@ conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our a
 	$(BIN)/python -m tests.conformance.fetch
 	$(BIN)/python -m tests.conformance.run $(CONFORMANCE_ARGS)
 
+# SMAX has an environment of its own: jaxmarl needs gymnasium<1.4, and its pins are those of Python 3.11
+$(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
+	$(PYTHON) -m venv $(SMAX_VENV)
+	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt torch
+	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt -e . pytest jaxmarl 'gymnasium<1.4'
+	@touch $@
+
+test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
+	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/test_smax.py $(PYTEST_ARGS)
+
 lint: $(STAMP)  ## look for mistakes
 	$(BIN)/ruff check $(SOURCES)
 
@@ -58,5 +70,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

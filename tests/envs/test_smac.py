@@ -1,0 +1,463 @@
+"""
+SMAC and SMACv2 against fakes with the same interface and the same faults. The last tests compare the fakes with the real
+packages, where these are installed.
+"""
+
+import copy
+import inspect
+import random
+import warnings
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test
+
+from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
+from sb3_belief.envs.adapters import smac, smacv2
+from tests.envs import fake_starcraft
+from tests.envs.tuple_families import train_save_load_evaluate
+
+make: Any = smac.make
+make_v2: Any = smacv2.make
+make_team_env: Any = team.make_team_env
+Team: Any = team.Team
+MAKERS = [partial(make, "3m"), partial(make, "2s3z"), partial(make_v2, "protoss_5_vs_5"), partial(make_v2, "zerg_10_vs_11")]
+
+
+@pytest.fixture
+def faults():
+    with fake_starcraft.installed() as installed:
+        yield installed
+
+
+def random_play(env, generator, act=None):
+    masks = {agent: env._masks[i] for i, agent in enumerate(env.possible_agents)}
+    chosen = {agent: int((generator.random(mask.shape) * mask).argmax()) for agent, mask in masks.items()}
+    return env.step({**chosen, **(act or {})})
+
+
+def near_the_limit(env, steps_left):
+    """
+    Go on as if only so many steps were left.
+    """
+    game = getattr(env.game, "env", env.game)
+    game._episode_steps = game.episode_limit - steps_left
+
+
+def hide(env):
+    """
+    Put everybody so far apart that a battle never ends.
+    """
+    for side, x in ((env.game.agents, 2.0), (env.game.enemies, 30.0)):
+        for unit in side.values():
+            unit.pos.x = x
+
+
+def still(env):
+    return {agent: 0 if env._masks[i, 0] else 1 for i, agent in enumerate(env.possible_agents)}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_pettingzoo_interface(faults, maker):
+    env = maker()
+    assert not faults.processes, "StarCraft starts when it is needed"
+    with warnings.catch_warnings():
+        # It samples actions without masks, and this environment refuses what is impossible
+        warnings.simplefilter("ignore")
+        with pytest.raises(ValueError, match="cannot do action"):
+            parallel_api_test(env, num_cycles=30)
+    observations, infos = env.reset(seed=0)
+    for agent in env.possible_agents:
+        assert env.observation_space(agent).contains(observations[agent])
+        assert infos[agent]["action_mask"].shape == (env.action_space(agent).n,)
+        assert infos[agent]["action_mask"].dtype == bool
+    assert not any(row.any() for row in env.visibility().values())
+    env.close()
+    assert not faults.running()
+
+
+@pytest.mark.parametrize("maker", [MAKERS[0], partial(make_v2, "terran_5_vs_5", conic_fov=True)])
+def test_no_illegal_action_is_sent_in_10000_steps(faults, maker):
+    env = maker()
+    generator = np.random.default_rng(0)
+    env.reset(seed=0)
+    ends = 0
+    for _ in range(10_000):
+        # The dead choose anything: it is not sent
+        dead = {a: int(generator.integers(env.n_actions)) for i, a in enumerate(env.possible_agents) if env._masks[i, 0]}
+        random_play(env, generator, dead)
+        if not env.agents:
+            env.reset()
+            ends += 1
+    assert len(faults.sent) == 10_000 and ends > 5
+    dead_orders = 0
+    for available, actions in faults.sent:
+        for possible, action in zip(available, actions, strict=True):
+            assert possible[action] == 1 and type(action) is int
+            dead_orders += possible[0]
+    assert dead_orders > 0
+    assert len(faults.running()) == 1
+
+
+def test_who_dies_is_inactive_and_is_given_the_teams_reward(faults):
+    env = make("2s3z")
+    generator = np.random.default_rng(1)
+    env.reset(seed=1)
+    rewarded = 0
+    for _ in range(600):
+        alive = [env.game.get_unit_by_id(i).health > 0 for i in range(5)]
+        observations, rewards, terminations, truncations, infos = random_play(env, generator)
+        assert [infos[agent]["active"] for agent in env.possible_agents] == alive
+        assert len(set(rewards.values())) == 1 and env.team_reward(rewards) == rewards["agent_3"]
+        assert all("life_end" not in info for info in infos.values())
+        for i, agent in enumerate(env.possible_agents):
+            if env.game.get_unit_by_id(i).health <= 0:
+                assert not observations[agent].any() and not env.visibility()[agent].any()
+                assert infos[agent]["action_mask"].tolist() == [k == 0 for k in range(11)]
+            rewarded += not alive[i] and rewards[agent] > 0
+        if not env.agents:
+            assert set(terminations.values()) | set(truncations.values()) == {True, False}
+            env.reset()
+        else:
+            assert env.agents == env.possible_agents
+    assert rewarded > 0
+
+
+@pytest.mark.parametrize("won", [True, False])
+def test_a_battle_that_is_over_terminates(faults, won):
+    env = make("3m")
+    env.reset(seed=0)
+    hide(env)
+    for unit in (env.game.enemies if won else env.game.agents).values():
+        unit.health = 0.0
+    # The masks are those of before
+    env._masks[:, 0] = not won
+    # Even at the step limit
+    near_the_limit(env, 1)
+    _, rewards, terminations, truncations, infos = env.step(still(env))
+    assert all(terminations.values()) and not any(truncations.values()) and not env.agents
+    assert {info["is_success"] for info in infos.values()} == {won}
+    assert rewards["agent_0"] == (10.0 if won else 0.0)
+    with pytest.raises(ValueError, match=r"call reset\(\)"):
+        env.step(still(env))
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_the_step_limit_truncates(faults, maker):
+    env = maker()
+    env.reset(seed=0)
+    hide(env)
+    near_the_limit(env, 2)
+    assert not any(env.step(still(env))[3].values())
+    _, _, terminations, truncations, infos = env.step(still(env))
+    assert not any(terminations.values()) and all(truncations.values()) and not env.agents
+    assert {info["is_success"] for info in infos.values()} == {False}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("first_battle", [True, False])
+def test_a_lost_connection_truncates_and_the_next_battle_begins(faults, maker, first_battle):
+    env = maker()
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    if not first_battle:
+        near_the_limit(env, 1)
+        random_play(env, generator)
+        env.reset()
+    observations = random_play(env, generator)[0]
+    faults.lost_steps.add(faults.n_steps + 1)
+    calls = faults.obs_calls
+    with pytest.warns(UserWarning, match="lost its connection"):
+        last, rewards, terminations, truncations, infos = random_play(env, generator)
+    assert all(truncations.values()) and not any(terminations.values()) and not env.agents
+    # The units of the closed game are not asked, nobody says that the battle was lost, and nobody saw anything
+    assert faults.obs_calls == calls
+    for agent in env.possible_agents:
+        np.testing.assert_array_equal(last[agent], observations[agent])
+        assert "is_success" not in infos[agent] and rewards[agent] == 0.0
+    assert not any(row.any() for row in env.visibility().values())
+    env.reset()
+    random_play(env, generator)
+    assert env.agents and len(faults.running()) == 1
+
+
+def test_a_lost_connection_under_the_vectoriser(faults):
+    env = make_team_env(partial(make, "3m"), n_envs=2, seed=0)
+    env.reset()
+    faults.lost_steps.add(2)
+    stop = {agent: np.ones(2, dtype=int) for agent in env.possible_agents}
+    with pytest.warns(UserWarning, match="lost its connection"):
+        _, _, dones, infos = env.step(stop)
+    assert dones.tolist() == [False, True]
+    assert infos[1]["TimeLimit.truncated"] is True and infos[1]["truncated"].all() and "is_success" not in infos[1]
+    assert env.step(stop)[2].tolist() == [False, False]
+
+
+def test_no_starcraft_is_left_behind(faults):
+    env = make("3m")
+    env.reset(seed=0)
+    # SMAC would launch another one at each reset before its first battle is over
+    for _ in range(3):
+        env.step(still(env))
+        env.reset()
+        assert len(faults.running()) == 1
+    hide(env)
+    near_the_limit(env, 1)
+    env.step(still(env))
+    launched = len(faults.processes)
+    env.reset()
+    env.step(still(env))
+    env.reset()
+    assert len(faults.processes) == launched, "from then on it goes on with the one that runs"
+    env.reset(seed=5)
+    assert len(faults.running()) == 1 and faults.running()[0].seed == 5
+    env.close()
+    env.close()
+    assert not faults.running()
+    env.reset()
+    assert len(faults.running()) == 1
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_connections_lost_at_the_beginning_of_a_battle(faults, maker):
+    env = maker()
+    faults.lost_resets = 2
+    env.reset(seed=0)
+    assert all(unit.health > 0 for unit in env.game.agents.values()) and len(faults.running()) == 1
+    near_the_limit(env, 1)
+    env.step(still(env))
+    faults.lost_resets = 1
+    env.reset()
+    assert env.game._episode_steps == 0 and len(faults.running()) == 1
+    faults.lost_resets = 3
+    with pytest.raises(RuntimeError, match="3 battles"):
+        env.reset()
+
+
+def test_an_error_that_is_no_lost_connection_is_raised(faults, monkeypatch):
+    env = make("3m")
+    monkeypatch.setattr(env.game, "init_units", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        env.reset()
+
+
+def test_reset_of_smacv2_that_returns_nothing(faults):
+    env = make_v2("terran_5_vs_5")
+    faults.missing_units = 2
+    observations, infos = env.reset(seed=0)
+    assert faults.missing_units == 0
+    for i, agent in enumerate(env.possible_agents):
+        np.testing.assert_array_equal(observations[agent], env.game.get_obs_agent(i).astype(np.float32))
+        assert infos[agent]["action_mask"].any()
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_observations_are_asked_for_once_per_step(faults, maker):
+    env = maker()
+    env.reset(seed=0)
+    assert faults.obs_calls == 1
+    for n in range(2, 6):
+        random_play(env, np.random.default_rng(n))
+        assert faults.obs_calls == n
+
+
+def visible_from_positions(env):
+    """
+    :return: who sees whom by positions, sight ranges and cones, and how often SMACv2's matrix says otherwise
+    """
+    game = env.game
+    n_agents = len(env.possible_agents)
+    sees = np.zeros((n_agents, n_agents), dtype=bool)
+    for i, unit in game.agents.items():
+        for j, other in game.agents.items():
+            dx, dy = other.pos.x - unit.pos.x, other.pos.y - unit.pos.y
+            near = np.hypot(dx, dy) < game.unit_sight_range(i)
+            if getattr(game, "conic_fov", False):
+                look_x, look_y = game.fov_directions[i]
+                cosine = (dx * look_x + dy * look_y) / max(np.hypot(dx, dy), 1e-9)
+                near = near and cosine > np.cos(np.pi / game.n_fov_actions)
+            sees[i, j] = i != j and near and unit.health > 0 and other.health > 0
+    return sees, int((game.get_visibility_matrix()[:, :n_agents] != sees).sum())
+
+
+@pytest.mark.parametrize(
+    ("maker", "matrix_is_right"),
+    [
+        (partial(make, "3m"), True),
+        (partial(make, "2s3z"), True),
+        (partial(make, "2s3z", obs_last_action=True), True),
+        (partial(make_v2, "zerg_10_vs_11", use_unit_ranges=False), True),
+        # Mixed sight ranges, or sight in a direction
+        (partial(make_v2, "zerg_10_vs_11"), False),
+        (partial(make_v2, "protoss_10_vs_10", conic_fov=True), False),
+    ],
+)
+def test_visibility(faults, maker, matrix_is_right):
+    env = maker()
+    generator = np.random.default_rng(2)
+    env.reset(seed=2)
+    n_agents = len(env.possible_agents)
+    hidden = differences = ends = 0
+    for _ in range(400):
+        # A direction for each, so that they lose sight of each other
+        apart = {a: 2 + i % 4 for i, a in enumerate(env.possible_agents) if env._masks[i, 2 + i % 4]}
+        random_play(env, generator, apart if generator.random() < 0.5 else None)
+        sees, wrong = visible_from_positions(env)
+        told = env.visibility()
+        for i, agent in enumerate(env.possible_agents):
+            assert told[agent].tolist() == np.delete(sees[i], i).tolist()
+        alive = sum(unit.health > 0 for unit in env.game.agents.values())
+        hidden += alive * (alive - 1) - sees.sum()
+        differences += wrong
+        if not env.agents:
+            # Also at the last step, of which nothing is known any more after the reset
+            ends += sees.any() or n_agents == 3
+            env.reset()
+    assert hidden > 0
+    assert (differences == 0) == matrix_is_right
+
+
+def test_observations(faults):
+    plain, timed, told = make("2s3z"), make("2s3z", obs_timestep_number=True), make("2s3z", obs_last_action=True)
+    timed_v2 = make_v2("protoss_5_vs_5", obs_timestep_number=True)
+    for env in (plain, timed, told, timed_v2):
+        observations, _ = env.reset(seed=3)
+        for agent, space in env.observation_spaces.items():
+            assert observations[agent].shape == space.shape and observations[agent].dtype == np.float32
+    # SMAC counts the time step once more than it says
+    assert timed.width == plain.width + 2 and timed.game.get_obs_size() == plain.width + 1
+    assert told.width == plain.width + 4 * 11
+    assert not plain.game.obs_last_action
+
+
+def test_seeds(faults):
+    def lives(env, seed, n_steps=150):
+        generator = np.random.default_rng(0)
+        rows = [np.stack(list(env.reset(seed=seed)[0].values()))]
+        for _ in range(n_steps):
+            rows.append(np.stack(list(random_play(env, generator)[0].values())))
+            if not env.agents:
+                rows.append(np.stack(list(env.reset()[0].values())))
+        return np.array(rows)
+
+    for maker in MAKERS:
+        first, second = maker(), maker()
+        random.seed(1)
+        life = lives(first, 7)
+        random.seed(2)
+        np.random.seed(2)
+        expected_random, expected_numpy = random.Random(2).random(), np.random.RandomState(2).random()
+        np.testing.assert_array_equal(life, lives(second, 7))
+        # On a used instance too
+        np.testing.assert_array_equal(life, lives(second, 7))
+        assert not np.array_equal(life[0], lives(second, 8, 0)[0])
+        if maker.func is make_v2:
+            # The process's own generators are as if nothing had been drawn
+            assert random.random() == expected_random and np.random.random() == expected_numpy
+        first.reset()
+        second.reset()
+
+
+def test_scenarios_of_smacv2(faults):
+    assert len(smacv2.names()) == 15 and smacv2.names()[:3] == ["protoss_5_vs_5", "terran_5_vs_5", "zerg_5_vs_5"]
+    for name in smacv2.names():
+        env = make_v2(name)
+        race, n_units, _, n_enemies = name.split("_")
+        assert len(env.possible_agents) == int(n_units) and env.n_actions == 6 + int(n_enemies)
+        assert env.game.env.map_name == f"10gen_{race}"
+        assert env.game.use_unit_ranges and env.game.obs_own_pos
+    config = smacv2.scenario("terran_5_vs_5")["capability_config"]
+    before = copy.deepcopy(config)
+    env = make_v2("10gen_terran", capability_config=config)
+    env.reset(seed=0)
+    env.reset(seed=1)
+    assert config == before, "the package writes into copies only"
+
+
+def test_wrong_use(faults):
+    with pytest.raises(ValueError, match="'4m'; there are 3m, 2s3z"):
+        make("4m")
+    with pytest.raises(ValueError, match="'terran'; there are protoss_5_vs_5"):
+        make_v2("terran")
+    for maker in (make, make_v2):
+        name = "3m" if maker is make else "zerg_5_vs_5"
+        with pytest.raises(ValueError, match="no argument 'seed'"):
+            maker(name, seed=3)
+        with pytest.raises(ValueError, match="no argument 'continuing_episode'"):
+            maker(name, continuing_episode=False)
+        with pytest.raises(ValueError, match="render_mode='ansi'"):
+            maker(name, render_mode="ansi")
+    with pytest.raises(ValueError, match="obs_starcraft"):
+        make_v2("zerg_5_vs_5", obs_starcraft=False)
+    with pytest.raises(ValueError, match="Unknown SMACv2 scenario '3m'"):
+        smacv2.scenario("3m")
+    env = make("3m")
+    with pytest.raises(ValueError, match=r"call reset\(\)"):
+        env.step({})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="No action for 'agent_1'"):
+        env.step({"agent_0": 1})
+    with pytest.raises(ValueError, match="'agent_0' is 9; allowed are the integers from 0 to 8"):
+        env.step({**still(env), "agent_0": 9})
+    with pytest.raises(ValueError, match=r"'agent_2' cannot do action 0 now, possible are \[1, .*MaskableBeliefPPO"):
+        env.step({**still(env), "agent_2": 0})
+    with pytest.raises(ValueError, match="without a render mode"):
+        env.render()
+    picture = make("3m", render_mode="rgb_array")
+    picture.reset()
+    assert picture.render().shape == (4, 4, 3)
+
+
+def test_results_can_name_the_version_of_starcraft(faults):
+    env = make("3m")
+    assert env.versions() == {"map": "smac/3m", "starcraft2": "unknown"}
+    env.reset()
+    assert env.versions() == {"map": "smac/3m", "starcraft2": "4.10.0"}
+    assert make_v2("zerg_5_vs_5").versions()["map"] == "smacv2/zerg_5_vs_5"
+
+
+@pytest.mark.parametrize("env_id", ["smac/2s3z", "smacv2/protoss_5_vs_5"])
+def test_a_team_learns_is_saved_and_evaluated(faults, tmp_path, env_id):
+    env = make_team_env(env_id, n_envs=2, seed=0)
+    maker = partial(make, "2s3z") if env_id.startswith("smac/") else partial(make_v2, "protoss_5_vs_5")
+    assert env.observation_space == make_team_env(maker).observation_space
+    assert len(train_save_load_evaluate(maker, tmp_path, MaskableBeliefPPO)) == 2
+    # Without masks it chooses what the game would not take
+    with pytest.raises(ValueError, match="heeds action masks"):
+        Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=64).learn(128)
+
+
+def parameters(function):
+    return list(inspect.signature(function).parameters)
+
+
+METHODS = (
+    "reset step get_obs get_obs_agent get_obs_size get_state get_state_size get_avail_actions get_avail_agent_actions"
+    " get_total_actions get_env_info get_visibility_matrix get_obs_move_feats_size get_obs_enemy_feats_size"
+    " get_obs_ally_feats_size get_obs_own_feats_size get_unit_by_id unit_sight_range full_restart render close seed"
+    " save_replay get_stats"
+).split()
+
+
+@pytest.mark.skipif(find_spec("smac") is None, reason="SMAC is not installed: its interface is compared where it is")
+def test_the_fake_has_the_interface_of_the_real_smac():
+    from smac.env import StarCraft2Env
+
+    assert parameters(fake_starcraft.StarCraft2Env) == parameters(StarCraft2Env)
+    for name in METHODS:
+        assert parameters(getattr(fake_starcraft.StarCraft2Env, name)) == parameters(getattr(StarCraft2Env, name)), name
+
+
+@pytest.mark.skipif(find_spec("smacv2") is None, reason="SMACv2 is not installed: its interface is compared where it is")
+def test_the_fake_has_the_interface_of_the_real_smacv2():
+    from smacv2.env.starcraft2.starcraft2 import StarCraft2Env
+    from smacv2.env.starcraft2.wrapper import StarCraftCapabilityEnvWrapper
+
+    fake = set(parameters(fake_starcraft.StarCraft2EnvV2)) | set(parameters(fake_starcraft.StarCraft2Env))
+    assert fake - {"kwargs"} == set(parameters(StarCraft2Env))
+    for name in METHODS:
+        assert hasattr(StarCraft2Env, name), name
+    assert parameters(fake_starcraft.StarCraftCapabilityEnvWrapper) == parameters(StarCraftCapabilityEnvWrapper)
