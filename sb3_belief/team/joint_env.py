@@ -1,5 +1,7 @@
 """One PettingZoo ``ParallelEnv`` as one Gymnasium environment, so that SB3's own vectorisers can hold copies of it."""
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium as gym
@@ -7,9 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.team.checks import check_names, check_observation, check_observation_kind, place
 from sb3_belief.team.scripted import ScriptedOthers, optional_member
 
 Flags: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+# Who could observe whose action of the last step: {agent: bool [n_others]}
+Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
 
 
 class StepRecord(NamedTuple):
@@ -40,19 +45,26 @@ class JointEnv(gym.Env):
     The info of a step has a ``StepRecord`` as ``joint``, of which ``ParallelTeamVecEnv`` makes the infos of a ``TeamVecEnv``.
 
     :param env: the environment, see the README for what it may offer beyond PettingZoo's interface
+    :param visibility: says whose actions agents could observe in the place of an environment that does not, see
+        ``make_team_env``
+    :param copy: number of this copy, for messages
     :raises TypeError: if it is not a ``ParallelEnv``, or is wrong about its scripted others
+    :raises ValueError: for an observation space of a kind that is not supported, and for ``visibility`` if the environment has
+        a method ``visibility()`` itself
     """
 
-    def __init__(self, env: ParallelEnv):
+    def __init__(self, env: ParallelEnv, visibility: Visibility | None = None, copy: int = 0):
         if not isinstance(env, ParallelEnv):
             raise TypeError(
                 f"A team needs a pettingzoo.ParallelEnv, got {type(env).__name__}. An AEC environment is converted by"
-                " pettingzoo.utils.conversions.aec_to_parallel; a Gymnasium environment has no team."
+                " sb3_belief.envs.to_parallel(); a Gymnasium environment has no team."
             )
         self.env = env
         self.possible_agents: list[str] = list(env.possible_agents)
         self.observation_spaces = {agent: env.observation_space(agent) for agent in self.possible_agents}
         self.action_spaces = {agent: env.action_space(agent) for agent in self.possible_agents}
+        for agent, space in self.observation_spaces.items():
+            check_observation_kind(agent, space)
         self.observation_space = spaces.Dict(self.observation_spaces)
         self.action_space = spaces.Dict(self.action_spaces)
         self.render_mode = getattr(env, "render_mode", None)
@@ -74,19 +86,35 @@ class JointEnv(gym.Env):
         for shared in (*self._uneventful, self._all_visible):
             shared.flags.writeable = False
         self._visibility = optional_member(env, "visibility")
+        if visibility is not None:
+            if self._visibility is not None:
+                raise ValueError(
+                    f"{type(env.unwrapped).__name__} says by its own visibility() who can observe whom, so the argument"
+                    " visibility is not for it: leave it out, or override the method in a wrapper."
+                )
+            self._visibility = partial(visibility, env)
         self._team_reward = optional_member(env, "team_reward")
         self._zero_obs = {
             agent: np.zeros(space.shape or (), dtype=space.dtype) for agent, space in self.observation_spaces.items()
         }
         self._has_masks = False
+        # For the checks: quick to compare with
+        self._names = dict.fromkeys(self.possible_agents).keys()
+        self._shapes = [(agent, space.shape) for agent, space in self.observation_spaces.items() if space.shape]
+        self._copy, self._t = copy, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
         """
         :param seed: seed of the environment, None: go on with its generator
         :param options: handed to the environment
         :return: {agent: observation} and {"action_masks": as in StepRecord} or {}
+        :raises ValueError: if the environment returns what does not fit its agents and spaces
         """
         obs, infos = self.env.reset(seed=seed, options=options)
+        self._t = 0
+        if obs.keys() != self._names or self.env.agents != self.possible_agents:
+            check_names(self.possible_agents, self.env.agents, self.env.agents, {"observations": obs}, place(self._copy, 0))
+        self._check_observations(obs, self.possible_agents)
         return self._observations(obs), self._masks(infos)
 
     def step(self, action: dict[str, Any]) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -94,11 +122,18 @@ class JointEnv(gym.Env):
         :param action: {agent: action} with an entry for every possible agent; those of agents that have left are ignored
         :return: {agent: observation}, team reward, terminated, truncated, {"joint": StepRecord}; observations are the
             environment's own arrays
+        :raises ValueError: if the environment returns what does not fit its agents and spaces
         """
         before = self.env.agents[:]
+        self._t += 1
         obs, rewards, terminations, truncations, infos = self.env.step({agent: action[agent] for agent in before})
         after = self.env.agents
         agents = self.possible_agents
+        if obs.keys() != self._names or rewards.keys() != self._names or after != agents:
+            check_names(agents, before, after, {"observations": obs, "rewards": rewards}, place(self._copy, self._t))
+        for agent, shape in self._shapes:
+            if agent in obs and getattr(obs[agent], "shape", None) != shape:
+                self._check_observations(obs, [agent])
         told = any(infos.values())
         left: list[str] = []
         successes: list[bool] = []
@@ -117,6 +152,9 @@ class JointEnv(gym.Env):
         info: dict[str, Any] = {"joint": StepRecord(agent_rewards, flags, visible, masks, scripted_actions)}
         if flags is self._uneventful:
             return obs, float(team_reward), False, False, info
+        if done or left:
+            # What a value at a time limit is computed from
+            self._check_observations(obs, agents if done else left)
         observations = self._observations(obs)
         if done:
             if successes:
@@ -190,6 +228,12 @@ class JointEnv(gym.Env):
             agent: np.asarray(obs[agent], dtype=zero.dtype) if agent in obs else zero for agent, zero in self._zero_obs.items()
         }
 
+    def _check_observations(self, obs: dict[str, Any], agents: list[str]) -> None:
+        where = place(self._copy, self._t)
+        for agent in agents:
+            if agent in obs:
+                check_observation(agent, obs[agent], self.observation_spaces[agent], where)
+
     def _visible(self, flags: Flags) -> np.ndarray:
         # Who is not in play neither sees nor shows anything
         active = flags[0]
@@ -202,15 +246,29 @@ class JointEnv(gym.Env):
             return in_play
         rows = self._visibility()
         unseen = np.zeros(self._others.shape[1], dtype=bool)
-        given = [rows.get(agent, unseen) for agent in self.possible_agents]
         try:
-            return np.array(given, dtype=bool).reshape(in_play.shape) & in_play
-        except ValueError:
-            raise ValueError(
-                f"visibility() must return {in_play.shape[1]} flags for each agent, the other agents in the order of"
-                f" possible_agents and then the scripted others {list(self.scripted_action_spaces)}; it returned"
-                f" {[np.size(row) for row in given]} for {self.possible_agents}."
-            ) from None
+            if rows.keys() <= self._names:
+                given = [rows.get(agent, unseen) for agent in self.possible_agents]
+                return np.array(given, dtype=bool).reshape(in_play.shape) & in_play
+        except (AttributeError, ValueError):
+            pass
+        raise self._wrong_visibility(rows)
+
+    def _wrong_visibility(self, rows: Any) -> ValueError:
+        n_others, where = self._others.shape[1], place(self._copy, self._t)
+        scripted = f" and then the scripted others {list(self.scripted_action_spaces)}" if self.scripted_action_spaces else ""
+        wanted = (
+            f"It must return a dict with {n_others} flags for each agent, the other agents in the order of possible_agents"
+            f"{scripted}; the agents are {self.possible_agents}."
+        )
+        if not isinstance(rows, Mapping):
+            return ValueError(f"visibility() returned a {type(rows).__name__} {where}. {wanted}")
+        for agent, row in rows.items():
+            if agent not in self._names:
+                return ValueError(f"visibility() has an entry for {agent!r} {where}, which is no agent. {wanted}")
+            if np.size(row) != n_others:
+                return ValueError(f"visibility() has {np.size(row)} flags for {agent!r} {where}. {wanted}")
+        return ValueError(f"visibility() returned what cannot be read as flags {where}: {dict(rows)}. {wanted}")
 
     def _masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
         self._has_masks = self._has_masks or any("action_mask" in info for info in infos.values())
@@ -221,7 +279,10 @@ class JointEnv(gym.Env):
             width = self._mask_widths[agent]
             mask = np.asarray(infos.get(agent, {}).get("action_mask", np.ones(width)), dtype=bool).ravel()
             if width and mask.size != width:
-                raise ValueError(f"The action mask of {agent!r} must have {width} entries, got {mask.size}.")
+                raise ValueError(
+                    f"The action mask of {agent!r} {place(self._copy, self._t)} must have {width} entries, one for each"
+                    f" action, got {mask.size}."
+                )
             masks.append(mask[:width])
         return {"action_masks": np.concatenate(masks)}
 

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_belief.team.checks import StepChecks
 from sb3_belief.team.joint_env import JointEnv, StepRecord, mask_width
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv, check_spaces
 
@@ -24,14 +25,19 @@ class ParallelTeamVecEnv(TeamVecEnv):
 
     :param env_fns: one callable per copy that makes its ``JointEnv``
     :param subproc: one worker process per copy instead of stepping them in turn here
+    :raises ValueError: for names or spaces that a team cannot have, or that are not the same in all copies
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], JointEnv]], subproc: bool = False):
         self.venv: DummyVecEnv | SubprocVecEnv
+        self._interrupted = False
+        self._masks: np.ndarray | None = None
         if subproc:
             self.venv = SubprocVecEnv([_without_interrupts(env_fn) for env_fn in env_fns])
         else:
             envs = [env_fn() for env_fn in env_fns]
+            if len({id(env.env) for env in envs}) < len(envs):
+                raise ValueError("The copies are one and the same environment: return a new one at each call.")
             # Before DummyVecEnv stumbles over them
             first = envs[0]
             check_spaces(first.possible_agents, first.observation_spaces, first.action_spaces, first.scripted_action_spaces)
@@ -39,20 +45,33 @@ class ParallelTeamVecEnv(TeamVecEnv):
             self.venv.layout = [
                 (agent, (len(envs), *(space.shape or ())), space.dtype) for agent, space in first.observation_spaces.items()
             ]
-        self._interrupted = False
-        self._masks: np.ndarray | None = None
-        agents: list[str] = self.venv.get_attr("possible_agents", [0])[0]
-        self._action_spaces: dict[str, spaces.Space] = self.venv.get_attr("action_spaces", [0])[0]
-        self._observation_spaces: dict[str, spaces.Space] = self.venv.get_attr("observation_spaces", [0])[0]
-        super().__init__(
-            len(env_fns),
-            agents,
-            self._observation_spaces,
-            self._action_spaces,
-            self.venv.render_mode,
-            self.venv.get_attr("scripted_action_spaces", [0])[0],
-        )
+        try:
+            agents, self._observation_spaces, self._action_spaces, scripted = self._common_members()
+            super().__init__(
+                len(env_fns), agents, self._observation_spaces, self._action_spaces, self.venv.render_mode, scripted
+            )
+        except BaseException:
+            self.venv.close()
+            raise
         self._discrete = [isinstance(self._action_spaces[agent], spaces.Discrete) for agent in agents]
+        self._mask_widths = [mask_width(self._action_spaces[agent]) for agent in agents]
+        self._checks = StepChecks(agents, self._observation_spaces, self._action_spaces, self._mask_widths)
+
+    def _common_members(self) -> list[Any]:
+        """
+        :return: names of the agents, their observation spaces and action spaces, and the scripted others' action spaces
+        """
+        members = []
+        for name in ("possible_agents", "observation_spaces", "action_spaces", "scripted_action_spaces"):
+            first, *others = self.venv.get_attr(name)
+            for copy, other in enumerate(others, start=1):
+                if other != first:
+                    raise ValueError(
+                        f"All copies must have the same {name}, but those of environment copy {copy} are {other} and those of"
+                        f" copy 0 are {first}."
+                    )
+            members.append(first)
+        return members
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
@@ -73,9 +92,9 @@ class ParallelTeamVecEnv(TeamVecEnv):
         """
         if self._masks is None:
             return None
-        widths = [mask_width(self._action_spaces[agent]) for agent in self.possible_agents]
-        parts = np.split(self._masks, np.cumsum(widths)[:-1], axis=1)
-        return {agent: part for agent, part, width in zip(self.possible_agents, parts, widths, strict=True) if width}
+        parts = np.split(self._masks, np.cumsum(self._mask_widths)[:-1], axis=1)
+        columns = zip(self.possible_agents, parts, self._mask_widths, strict=True)
+        return {agent: part for agent, part, width in columns if width}
 
     def close(self) -> None:
         """End the workers or close the copies."""
@@ -106,14 +125,17 @@ class ParallelTeamVecEnv(TeamVecEnv):
         with self._worker_deaths("reset"):
             obs = self.venv.reset()
         reset_infos = self.venv.reset_infos
-        self._masks = np.array([info["action_masks"] for info in reset_infos]) if "action_masks" in reset_infos[0] else None
+        self._masks = None
+        if "action_masks" in reset_infos[0]:
+            self._masks = np.array([info["action_masks"] for info in reset_infos])
+            self._checks.masks(self._masks, np.zeros(self.num_envs, dtype=int))
         return obs  # type: ignore[return-value]
 
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         self._finish_interrupted_step()
         # Plain integers for Discrete: what PettingZoo environments are tested with
         columns = [
-            actions[agent].tolist() if discrete else actions[agent]
+            (self._checks.number if discrete else self._checks.vector)(agent, actions[agent], self._lengths)
             for agent, discrete in zip(self.possible_agents, self._discrete, strict=True)
         ]
         joint_actions = [dict(zip(self.possible_agents, row)) for row in zip(*columns)]  # noqa: B905 (lengths are checked)
@@ -125,6 +147,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
             obs, rewards, dones, venv_infos = self.venv.step(joint_actions)  # type: ignore[arg-type]
         records: list[StepRecord] = [venv_info["joint"] for venv_info in venv_infos]
         agent_rewards = np.array([record.agent_rewards for record in records], dtype=np.float32)
+        self._checks.numbers(obs, agent_rewards, self._lengths)
         infos = []
         for venv_info, record, own_rewards in zip(venv_infos, records, agent_rewards, strict=True):
             active, life_end, truncated = record.flags
@@ -149,6 +172,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
                     for i, (record, done) in enumerate(zip(records, dones, strict=True))
                 ]
             )
+            self._checks.masks(self._masks, np.where(dones, 0, self._lengths + 1))
         return obs, np.asarray(rewards, dtype=np.float32), dones, infos
 
     # Workers

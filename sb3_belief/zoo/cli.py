@@ -1,6 +1,7 @@
-"""The command line: ``sb3-belief train | enjoy | demo``."""
+"""The command line: ``sb3-belief train | enjoy | envs | demo``."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 
@@ -15,9 +16,10 @@ def make_parser() -> argparse.ArgumentParser:
     :return: the parser of ``sb3-belief``
     """
     parser = argparse.ArgumentParser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
-    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | demo")
+    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | envs | demo")
     _add_train(commands.add_parser("train", help="train a team from a YAML configuration", **_STYLE))
     _add_enjoy(commands.add_parser("enjoy", help="replay a trained team", **_STYLE))
+    _add_envs(commands.add_parser("envs", help="list the environments, or check one", **_STYLE))
     _add_demo(commands.add_parser("demo", help="train, measure and show a team on Traffic Junction", **_STYLE))
     return parser
 
@@ -39,20 +41,26 @@ def _positive_or_off(text: str) -> int:
     return -1 if text == "-1" else _positive(text)
 
 
-def _add_common(parser: argparse.ArgumentParser) -> None:
+def _add_env_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"for the environment: {_PAIRS}")
-    parser.add_argument("--device", default="auto", help="cpu, cuda, ... or auto")
     parser.add_argument(
         "--allow-package",
         **_LIST,
         metavar="NAME",
-        help="further packages that dotted paths in the configuration may point into",
+        help="further packages that may be imported: by dotted paths in the configuration, by an environment module:callable",
     )
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    _add_env_options(parser)
+    parser.add_argument("--device", default="auto", help="cpu, cuda, ... or auto")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algo", help=f"algorithm of every agent (default: {_ALGO}, with -i the saved team's)")
-    parser.add_argument("--env", help=f"id of the environment (default: {_ENV}, with -i the saved team's)")
+    parser.add_argument(
+        "--env", help=f"id of the environment, see sb3-belief envs (default: {_ENV}, with -i the saved team's)"
+    )
     parser.add_argument("-n", "--n-timesteps", type=_positive, help="joint steps, instead of the configuration's")
     parser.add_argument("--seed", type=int, help="of the team and its environments; left out: drawn and written down")
     parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
@@ -87,6 +95,18 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
 
 
+def _add_envs(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(family=None)
+    what = parser.add_subparsers(dest="what", metavar="list | check")
+    listing = what.add_parser("list", help="what there is, what is installed and what installs the rest", **_STYLE)
+    listing.add_argument("family", nargs="?", help="list all ids of this one")
+    check = what.add_parser("check", help="play an environment and say what it lacks for a team", **_STYLE)
+    check.add_argument("env", help="id of the environment, or module:callable")
+    check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="how long to play")
+    check.add_argument("--seed", type=int, default=0, help="of the environment")
+    _add_env_options(check)
+
+
 def _add_demo(parser: argparse.ArgumentParser) -> None:
     from sb3_belief.zoo.demo import EPISODES, TIMESTEPS
 
@@ -101,11 +121,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     The command ``sb3-belief``.
 
     :param argv: the words after the command's name; None: those of the process
-    :return: exit status: 0, 2 if something was refused, 130 after Ctrl-C
+    :return: exit status: 0, 1 if an environment failed its check, 2 if something was refused, 130 after Ctrl-C
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     args = make_parser().parse_args(argv)
-    action = {"train": _train, "enjoy": _enjoy, "demo": _demo}[args.subcommand]
+    action = {"train": _train, "enjoy": _enjoy, "envs": _envs, "demo": _demo}[args.subcommand]
     return _run(action, args, ["sb3-belief", *argv])
 
 
@@ -123,6 +143,9 @@ def train_main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.Namespace, command: list[str]) -> int:
+    if getattr(args, "allow_package", None) and os.getcwd() not in sys.path:
+        # Code of one's own may lie here, as for "python -m"; last, so that it hides no installed package
+        sys.path.append(os.getcwd())
     try:
         return action(args, command)
     except ConfigError as error:
@@ -165,6 +188,16 @@ def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
             extra_packages=tuple(args.allow_package),
         )
     )
+    return 0
+
+
+def _envs(args: argparse.Namespace, _: list[str]) -> int:
+    from sb3_belief.zoo.envs import check_env, list_envs
+
+    if args.what == "check":
+        fine = check_env(args.env, args.env_kwargs, args.n_timesteps, args.seed, tuple(args.allow_package))
+        return 0 if fine else 1
+    print(list_envs(args.family))
     return 0
 
 

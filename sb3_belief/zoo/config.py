@@ -5,7 +5,6 @@ A file maps environment ids to settings; its section ``default`` lies under ever
 by itself, before anything is made, so that a refusal can name the file, the section and the key.
 """
 
-import importlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,10 +17,9 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_belief.envs import registry
 from sb3_belief.zoo.checks import Place, check_call, check_value, parameters
 from sb3_belief.zoo.errors import ConfigError, unknown
-from sb3_belief.zoo.names import Algo, get_algo, resolve
+from sb3_belief.zoo.names import Algo, get_algo, get_env, load_env, resolve
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
 DEFAULT = "default"
@@ -106,7 +104,7 @@ def load_config(
 ) -> RunConfig:
     """
     :param algo: name of the algorithm (``names.ALGOS``)
-    :param env_id: registered id of the environment
+    :param env_id: id of the environment: a registered one, ``family/name`` or ``module:callable``
     :param conf_file: YAML file to read instead of ``zoo_configs/<algo>.yml``
     :param params: ``key:value`` pairs that win over the file
     :param env_kwargs: ``key:value`` pairs for the environment
@@ -116,14 +114,12 @@ def load_config(
     :raises ConfigError: for whatever does not fit, naming its place, what is allowed and the nearest match
     """
     chosen = get_algo(algo)
-    if env_id not in registry.registered_ids():
-        raise unknown("--env", "environment", env_id, registry.registered_ids())
+    make_env = load_env(env_id, "--env", extra_packages)
     path = find_config_file(algo, conf_file)
     sections = read_file(path)
-    allowed_sections = [*registry.registered_ids(), DEFAULT]
     for name in sections:
-        if name not in allowed_sections:
-            raise unknown(str(path), "environment", name, allowed_sections)
+        if name != DEFAULT:
+            get_env(name, str(path))
     if not sections.keys() & {env_id, DEFAULT}:
         there = ", ".join(sections) or "none"
         raise ConfigError(f"{path}: has no section {env_id!r} and no section {DEFAULT!r}; it has {there}.")
@@ -139,7 +135,7 @@ def load_config(
     for place, layer in layers:
         if layer is not None and not isinstance(layer, dict):
             raise ConfigError(f"{place.text}: must be a mapping of settings, not {layer!r}.")
-    checker = _LayerChecker(chosen, env_id, _policy_name(layers))
+    checker = _LayerChecker(chosen, make_env, len(get_env(env_id, "--env").leading), _policy_name(layers))
     settings: dict[str, Any] = {}
     checked: dict[str, Any] = {}
     for place, layer in layers:
@@ -193,14 +189,14 @@ class _LayerChecker:
     Checks one source of settings after the other against one algorithm and one environment.
 
     :param algo: the algorithm
-    :param env_id: id of the environment
+    :param make_env: what makes the environment
+    :param n_leading: how many of its arguments the environment's id stands for
     :param policy: the policy's name after merging, whose arguments ``policy_kwargs`` are
     """
 
-    def __init__(self, algo: Algo, env_id: str, policy: Any) -> None:
+    def __init__(self, algo: Algo, make_env: Callable[..., Any], n_leading: int, policy: Any) -> None:
         self.algo_class = algo.load()
-        module, _, attribute = registry.spec(env_id).parallel.partition(":")
-        self.env_class = getattr(importlib.import_module(module), attribute)
+        self.make_env, self.n_leading = make_env, n_leading
         self.policies = self.algo_class.policy_aliases
         self.policy_class = self.policies.get(policy) if isinstance(policy, str) else None
         arguments, _ = parameters(self.algo_class)
@@ -238,7 +234,7 @@ class _LayerChecker:
         if key == "policy_kwargs" and self.policy_class is not None:
             return check_call(self.policy_class, value, place, reserved=self.policy_reserved)
         if key == "env_kwargs":
-            return check_call(self.env_class, value, place)
+            return check_call(self.make_env, value, place, skip=self.n_leading)
         if key == "env_wrapper":
             return tuple(self._check_calls(value, place, skip=1))
         if key == "callback":

@@ -1,13 +1,16 @@
 """Watch a trained team: in a window, or as a GIF or MP4."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sb3_belief.envs.registry import make_parallel_env
+from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
+from sb3_belief.zoo.checks import parameters
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import Outcome
@@ -92,7 +95,7 @@ def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
 
 def _frame_rate(config: RunConfig) -> int:
     # SB3's vectorised environments do not pass this on
-    env = make_parallel_env(config.env_id, **config.env_kwargs)
+    env = _make_one(config)
     rate = env.metadata.get("render_fps", 10)
     env.close()
     return int(rate)
@@ -107,8 +110,9 @@ def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
     algo, env_id, conf_file = run
     config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=options.extra_packages)
     render_mode = "human" if options.output is None else "rgb_array"
-    env = make_parallel_env(config.env_id, **config.env_kwargs)
-    has_pictures = render_mode in env.metadata.get("render_modes", [])
+    env = _make_one(config)
+    arguments, open_ended = parameters(spec(config.env_id).load())
+    has_pictures = render_mode in env.metadata.get("render_modes", []) and (open_ended or "render_mode" in arguments)
     env.close()
     if has_pictures:
         return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode})
@@ -117,10 +121,21 @@ def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
     return config
 
 
+def _make_one(config: RunConfig) -> Any:
+    with _refusals(config):
+        return make_parallel_env(config.env_id, **config.env_kwargs)
+
+
 def _make_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:
-    try:
+    with _refusals(config):
         return make_team_env(config.env_id, seed=options.seed, env_kwargs=config.env_kwargs, wrapper=config.wrapper)
-    except (ValueError, TypeError) as error:
+
+
+@contextmanager
+def _refusals(config: RunConfig) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, ImportError) as error:
         raise ConfigError(f"enjoy: {config.env_id} refuses its settings: {error}") from error
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_belief.envs.families import FAMILIES
+from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
 from sb3_belief.zoo.errors import ConfigError, nearest, unknown
 
 #: Packages (or parts of them) that a dotted path in a YAML file may point into
@@ -110,3 +112,36 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     if not is_code or not _is_allowed(found.__module__, packages):
         raise ConfigError(f"{where}: {path!r} is not a class or function that its package defines itself. {allowed}")
     return found
+
+
+def get_env(env_id: str, where: str) -> EnvSpec:
+    """
+    :param env_id: a registered id, ``family/name`` or ``module:callable``
+    :param where: file and section, or flag, for the error message
+    :return: its specification; nothing is imported for it
+    :raises ConfigError: for another id
+    """
+    try:
+        return spec(env_id)
+    except ValueError as error:
+        if "/" in env_id or env_id in FAMILIES:
+            raise ConfigError(f"{where}: {error}") from None
+        kinds = [*registered_ids(), *(f"{family}/<name>" for family in FAMILIES), "<module>:<callable>"]
+        raise unknown(where, "environment", env_id, kinds) from None
+
+
+def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
+    """
+    :param env_id: see ``get_env``
+    :param where: flag, for the error message
+    :param extra_packages: see ``resolve``; a ``module:callable`` must be of an allowed package
+    :return: what makes one copy of the environment
+    :raises ConfigError: for an id that is none or is not allowed, or whose package is not installed
+    """
+    found = get_env(env_id, where)
+    if found.parallel == env_id:
+        return resolve(env_id.replace(":", "."), where, extra_packages)
+    try:
+        return found.load()
+    except ImportError as error:
+        raise ConfigError(f"{where}: {error}") from error

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import shlex
 import time
 from pathlib import Path
@@ -19,25 +20,34 @@ CHECKPOINTS = "checkpoints"
 
 def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) -> Path:
     """
-    Make ``<log_folder>/<algo>/<env_id>_<k>/`` with k one above the highest there is. Runs that start at the same moment get
-    different folders: making one fails if another was faster, and then the next number is tried.
+    Make ``<log_folder>/<algo>/<env>_<k>/`` with k one above the highest there is, and the environment's id as ``folder_name``
+    writes it. Runs that start at the same moment get different folders: making one fails if another was faster, and then the
+    next number is tried.
 
     :param log_folder: folder of all runs
     :param algo: name of the algorithm
     :param env_id: id of the environment
     :return: the new, empty folder
     """
-    parent = Path(log_folder) / algo
-    numbers = [path.name.removeprefix(f"{env_id}_") for path in parent.glob(f"{env_id}_*")]
+    parent, name = Path(log_folder) / algo, folder_name(env_id)
+    numbers = [path.name.removeprefix(f"{name}_") for path in parent.glob(f"{name}_*")]
     number = max((int(text) for text in numbers if text.isdecimal()), default=0)
     while True:
         number += 1
-        folder = parent / f"{env_id}_{number}"
+        folder = parent / f"{name}_{number}"
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
             continue
         return folder
+
+
+def folder_name(env_id: str) -> str:
+    """
+    :param env_id: id of an environment, e.g. ``"mpe/simple_spread_v3"`` or ``"my_games:make"``
+    :return: one folder's name: ``"mpe-simple_spread_v3"``, ``"my_games-make"``
+    """
+    return re.sub(r"[^\w.-]", "-", env_id)
 
 
 def remove_run_folder(folder: Path) -> None:

@@ -15,7 +15,16 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError
-from sb3_belief.zoo.run_folder import CHECKPOINTS, CONFIG, TEAM, RunRecord, find_team, make_run_folder, remove_run_folder
+from sb3_belief.zoo.run_folder import (
+    CHECKPOINTS,
+    CONFIG,
+    TEAM,
+    RunRecord,
+    find_team,
+    folder_name,
+    make_run_folder,
+    remove_run_folder,
+)
 
 # Evaluation copies get seeds far from those of the training copies
 EVAL_SEED_OFFSET = 1_000_000
@@ -131,7 +140,7 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") 
         return make_team_env(
             config.env_id, n_envs=n_envs, seed=seed, vec_env=vec_env, env_kwargs=config.env_kwargs, wrapper=config.wrapper
         )
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, ImportError) as error:
         raise ConfigError(f"{config.source}: {config.env_id} refuses its settings: {error}") from error
 
 
@@ -155,7 +164,8 @@ def make_team(
     """
     common: dict[str, Any] = dict(
         device=options.device,
-        tensorboard_log=options.tensorboard_log and str(Path(options.tensorboard_log, config.algo, config.env_id)),
+        tensorboard_log=options.tensorboard_log
+        and str(Path(options.tensorboard_log, config.algo, folder_name(config.env_id))),
         verbose=options.verbose,
         log_dir=None if folder is None else str(folder),
     )

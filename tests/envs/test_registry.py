@@ -1,21 +1,29 @@
+import re
 import subprocess
 import sys
+from importlib import metadata
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sb3_belief.envs import (
+    FAMILIES,
     EnvSpec,
     SwitchingConvention,
     TrafficJunction,
+    families,
     make_batched_env,
     make_parallel_env,
+    register,
     registered_ids,
     spec,
 )
 from sb3_belief.envs import registry as registry_module
 from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
+from sb3_belief.team import make_team_env
+from tests.team.toy_envs import ToyEnv
 
 
 def test_all_ids_make_what_they_say():
@@ -58,6 +66,10 @@ def test_unknown_id_names_the_nearest_and_all():
         make_parallel_env("zzz")
     with pytest.raises(ValueError, match="Unknown environment id"):
         make_batched_env("zzz", 2)
+    with pytest.raises(ValueError, match=r"Did you mean .*'smax/'.*Families: .*smax/<name>"):
+        spec("smx/3m")
+    with pytest.raises(ValueError, match=r"'mpe/' lacks the environment's name; its ids are 'mpe/<name>': .*simple_spread_v3"):
+        spec("mpe/")
 
 
 def test_spec_without_batched_class_and_read_only_kwargs(monkeypatch):
@@ -81,3 +93,142 @@ def test_importing_environments_loads_no_pygame_and_no_team():
     )
     result = subprocess.run([sys.executable, "-c", bare + code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["False", "False", "False"]
+
+
+@pytest.fixture
+def own_registry(monkeypatch):
+    """Registrations of a test end with it."""
+    monkeypatch.setattr(registry_module, "_SPECS", dict(registry_module._SPECS))
+
+
+def test_looking_at_the_registry_imports_no_package():
+    roots = sorted({module.partition(".")[0] for family in FAMILIES.values() for module in family.modules} - {"pettingzoo"})
+    code = (
+        "import sys; from sb3_belief.envs import registry\n"
+        "for family in registry.FAMILIES.values(): registry.spec(f'{family.name}/x'); family.missing()\n"
+        f"print([name for name in {roots} if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda family: family.name)
+def test_a_missing_package_is_named_with_the_line_that_installs_it(family, monkeypatch):
+    monkeypatch.setattr(families, "is_installed", lambda module: False)
+    makers: list[Any] = [make_parallel_env, make_team_env]
+    if family.batched is not None:
+        makers.append(lambda id: make_batched_env(id, 2))
+    for make in makers:
+        with pytest.raises(ModuleNotFoundError, match=re.escape(family.install)) as error:
+            make(f"{family.name}/3m")
+        assert error.value.name == family.modules[0] and family.note in str(error.value)
+
+
+def test_the_missing_smac_warns_of_the_other_project(monkeypatch):
+    monkeypatch.setattr(families, "is_installed", lambda module: False)
+    with pytest.raises(ModuleNotFoundError, match="Not 'pip install smac', which installs another project"):
+        make_parallel_env("smac/3m")
+
+
+def test_the_other_project_called_smac_is_not_taken_for_it(tmp_path, monkeypatch):
+    (tmp_path / "smac").mkdir()
+    (tmp_path / "smac" / "__init__.py").write_text("raise RuntimeError('imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert families.is_installed("smac") and not families.is_installed("smac.env.starcraft2")
+    (tmp_path / "smac" / "env" / "starcraft2").mkdir(parents=True)
+    for folder in ("env", "env/starcraft2"):
+        (tmp_path / "smac" / folder / "__init__.py").touch()
+    assert families.is_installed("smac.env.starcraft2") and "smac" not in sys.modules
+
+
+def test_a_module_and_a_callable_are_an_id():
+    team_env = make_team_env("tests.team.toy_envs:ToyEnv", n_envs=2, env_kwargs={"n_agents": 3, "limit": 4})
+    assert team_env.possible_agents == ["agent_0", "agent_1", "agent_2"] and team_env.reset()["agent_0"].shape == (2, 2)
+    assert make_batched_env("tests.team.toy_envs:ToyEnv", 2) is None
+
+
+@pytest.mark.parametrize(
+    ("id", "message"),
+    [
+        ("tests.team.toy_envs:NoEnv", "'NoEnv' of the module 'tests.team.toy_envs', which cannot be imported: .*NoEnv"),
+        ("no_such_module:make", "cannot be imported: No module named 'no_such_module'"),
+        ("tests.team.helpers:PPO_KWARGS", "is a dict, not a callable"),
+        ("os;exit():x", "Unknown environment id"),
+    ],
+)
+def test_a_module_or_callable_that_is_none(id, message):
+    with pytest.raises(ValueError, match=message):
+        make_parallel_env(id)
+
+
+def test_users_register_theirs_with_a_decorator(own_registry):
+    def define(limit):
+        @register("my/toy-2", kwargs={"n_agents": 4})
+        class MyToy(ToyEnv):
+            default = limit
+
+        return MyToy
+
+    first = define(3)
+    assert registered_ids()[-1] == "my/toy-2"
+    env = make_parallel_env("my/toy-2", limit=5)
+    assert type(env) is first and (len(env.possible_agents), env.limit) == (4, 5)
+    # a notebook's cell that is run again
+    assert type(make_parallel_env("my/toy-2")) is not define(4)
+    assert make_parallel_env("my/toy-2").default == 4
+    for taken in ("my/toy-2", "traffic-junction-easy"):
+        with pytest.raises(ValueError, match=f"The id '{taken}' is another environment's already"):
+            register(taken)(ToyEnv)
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_what_a_user_registered_makes_a_team(own_registry, vec_env):
+    # a worker process knows nothing of what was registered here
+    register("mine")(lambda limit=7: ToyEnv(2, limit))
+    env = make_team_env("mine", n_envs=2, vec_env=vec_env, env_kwargs={"limit": 1})
+    env.reset()
+    assert env.step({agent: np.zeros(2, int) for agent in env.possible_agents})[2].tolist() == [True, True]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("id", "message"),
+    [
+        ("smax/mine", "is of the family 'smax'"),
+        ("mpe", "is of the family 'mpe'"),
+        ("", "cannot be an id"),
+        ("a:b", "cannot be an id"),
+        ("../a", "cannot be an id"),
+    ],
+)
+def test_ids_that_cannot_be_registered(id, message, own_registry):
+    with pytest.raises(ValueError, match=message):
+        register(id)
+    assert id not in registered_ids()
+
+
+def test_only_what_can_be_called_is_registered(own_registry):
+    with pytest.raises(TypeError, match="got ToyEnv"):
+        register("mine")(ToyEnv())
+
+
+def test_installed_packages_register_theirs_by_entry_points(monkeypatch, own_registry):
+    points = [
+        metadata.EntryPoint(name, value, registry_module.ENTRY_POINT_GROUP)
+        for name, value in [
+            ("their-toy", "tests.team.toy_envs:ToyEnv"),
+            ("lbf/mine", "tests.team.toy_envs:ToyEnv"),
+            ("traffic-junction-easy", "tests.team.toy_envs:ToyEnv"),
+            ("broken", "tests.team.toy_envs"),
+        ]
+    ]
+    monkeypatch.setattr(registry_module.metadata, "entry_points", lambda group: points)
+    registry_module._installed_specs.cache_clear()
+    try:
+        with pytest.warns(UserWarning) as warned:
+            assert registered_ids()[-1] == "their-toy"
+        assert [str(warning.message).split("'")[1] for warning in warned] == ["lbf/mine", "traffic-junction-easy", "broken"]
+        assert isinstance(make_parallel_env("their-toy"), ToyEnv)
+        assert isinstance(make_parallel_env("traffic-junction-easy"), TrafficJunction)
+    finally:
+        registry_module._installed_specs.cache_clear()

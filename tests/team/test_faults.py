@@ -16,6 +16,14 @@ from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, paramete
 from tests.team.toy_envs import FaultyEnv, ToyEnv
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_interrupts():
+    """Also where the tests run in the background, where a shell lets Ctrl-C be ignored."""
+    old = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, old)
+
+
 def make_team(env=None, n_agents=3, **kwargs):
     env = env or make_team_env(partial(ToyEnv, n_agents=n_agents), n_envs=2)
     return Team(PPO, "MlpPolicy", env, seed=0, **{**PPO_KWARGS, **kwargs})

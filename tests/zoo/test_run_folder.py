@@ -4,12 +4,23 @@ import threading
 import pytest
 
 from sb3_belief.zoo.errors import ConfigError
-from sb3_belief.zoo.run_folder import RunRecord, find_team, make_run_folder, run_of
+from sb3_belief.zoo.run_folder import RunRecord, find_team, make_run_folder, remove_run_folder, run_of
 
 
 def test_folders_are_numbered_by_algorithm_and_environment(tmp_path):
     names = [make_run_folder(tmp_path, algo, "env").relative_to(tmp_path).as_posix() for algo in ("ppo", "ppo", "a2c")]
     assert names == ["ppo/env_1", "ppo/env_2", "a2c/env_1"]
+
+
+def test_an_environments_id_is_one_folder(tmp_path):
+    ids = ["mpe/simple_spread_v3", "my_games.toys:make", "mpe/simple_spread_v3", "mpe/../../x"]
+    folders = [make_run_folder(tmp_path, "ppo", env_id) for env_id in ids]
+    names = ["mpe-simple_spread_v3_1", "my_games.toys-make_1", "mpe-simple_spread_v3_2", "mpe-..-..-x_1"]
+    assert [folder.relative_to(tmp_path / "ppo").as_posix() for folder in folders] == names
+    (tmp_path / "kept").touch()
+    for folder in folders:
+        remove_run_folder(folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
 def test_a_number_is_never_used_twice(tmp_path):
