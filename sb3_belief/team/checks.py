@@ -16,6 +16,22 @@ def place(copy: int, step: int) -> str:
     return f"in environment copy {copy} at " + (f"step {step}" if step else "reset")
 
 
+def check_wrappers(env: Any) -> None:
+    """
+    :param env: a ``ParallelEnv``, with or without wrappers
+    :raises ValueError: for a wrapper that hides what a team has to know
+    """
+    while env is not None:
+        if type(env).__name__ == "black_death_par":
+            raise ValueError(
+                "supersuit.black_death_v3 is not needed here, and hides which agents are still in play, and whether they"
+                " terminated or were cut by a limit. A team does its work: who leaves early stays a member with a zero"
+                " observation, and is known to be inactive. Leave it out."
+            )
+        # "aec_env": below a conversion from AEC
+        env = vars(env).get("env") or vars(env).get("aec_env")
+
+
 def check_observation_kind(agent: str, space: Any) -> None:
     """
     :param agent: its name
