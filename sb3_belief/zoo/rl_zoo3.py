@@ -1,0 +1,162 @@
+"""This package's algorithms in RL Baselines3 Zoo (``rl_zoo3``), whose own ``train`` then runs them with our YAML files."""
+
+import importlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.zoo.checks import Place, check_value, parameters
+from sb3_belief.zoo.config import DEFAULT, find_config_file
+from sb3_belief.zoo.yaml_data import merge, read_file
+
+# rl_zoo3 reads these by itself, schedules included
+_READ_BY_ZOO = ("policy", "policy_kwargs", "learning_rate", "clip_range", "clip_range_vf")
+_SIZES = ("embedding_dim", "latent_dim")
+
+
+class IndependentPPO(BeliefPPO):
+    """``BeliefPPO`` with ``belief="none"``: ``ippo`` as a class, since rl_zoo3 knows algorithms by their classes."""
+
+    def __init__(self, policy: Any, env: Any, **kwargs: Any) -> None:
+        super().__init__(policy, env, belief="none", **kwargs)
+
+
+ALGOS: Mapping[str, type[BaseAlgorithm]] = {
+    "belief_ppo": BeliefPPO,
+    "ippo": IndependentPPO,
+    "maskable_belief_ppo": MaskableBeliefPPO,
+}
+
+
+def register_rl_zoo3() -> None:
+    """
+    Make ``belief_ppo``, ``ippo`` and ``maskable_belief_ppo`` known to rl_zoo3: to ``train`` and ``enjoy``, and to the search
+    for hyper-parameters with a sampler and a converter each. To be called before ``rl_zoo3.train.train()``::
+
+        import gymnasium as gym
+        from rl_zoo3.train import train
+        from sb3_belief.zoo import register_rl_zoo3
+
+        gym.register("Car-v0", "sb3_belief:AgentEnv", kwargs={"parallel_env": ..., "agent": ..., "partners": ...})
+        register_rl_zoo3()
+        train()
+
+    For these algorithms ``--conf-file`` (default: ``zoo_configs/<algo>.yml``) is read as by ``sb3-belief``: the section
+    ``default`` lies under every other one, ``3e-4`` is a number, dotted paths and ``lin_x`` are possible wherever the
+    algorithm takes a class or a schedule. All else is rl_zoo3's: its ``env_wrapper`` wraps the learner's environment.
+    rl_zoo3 evaluates without action masks: give ``--eval-freq -1`` where an environment refuses actions.
+
+    :raises ModuleNotFoundError: if rl_zoo3 is not installed, with the line that installs it
+    """
+    try:
+        train, utils, exp_manager, search = (
+            importlib.import_module(f"rl_zoo3.{name}") for name in ("train", "utils", "exp_manager", "hyperparams_opt")
+        )
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rl_zoo3":
+            raise
+        raise ModuleNotFoundError(
+            "register_rl_zoo3() needs RL Baselines3 Zoo, which is not installed: pip install rl_zoo3", name="rl_zoo3"
+        ) from error
+    utils.ALGOS.update(ALGOS)
+    sample, convert = _with_belief(search.sample_ppo_params, search.convert_onpolicy_params)
+    for algo in ALGOS:
+        searched = (search.sample_ppo_params, search.convert_onpolicy_params) if algo == "ippo" else (sample, convert)
+        search.HYPERPARAMS_SAMPLER[algo], search.HYPERPARAMS_CONVERTER[algo] = searched
+    # Seen by mypy as plain modules
+    vars(train)["ExperimentManager"] = _reading_our_files(exp_manager.ExperimentManager)
+
+
+def _with_belief(sample_ppo: Callable[..., Any], convert_ppo: Callable[..., Any]) -> tuple[Callable, Callable]:
+    """
+    :param sample_ppo: rl_zoo3's sampler of PPO's hyper-parameters
+    :param convert_ppo: rl_zoo3's converter of what was sampled
+    :return: sampler and converter for an algorithm with a belief
+    """
+
+    def convert(sampled: dict[str, Any]) -> dict[str, Any]:
+        sizes = {name: sampled[name] for name in _SIZES}
+        hyperparams = convert_ppo({name: value for name, value in sampled.items() if name not in sizes})
+        hyperparams["policy_kwargs"] = {**hyperparams["policy_kwargs"], **sizes}
+        return hyperparams
+
+    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+        hyperparams = sample_ppo(trial, n_actions, n_envs, additional_args)
+        hyperparams["history_length"] = trial.suggest_categorical("history_length", [100, 200, 400, 800, 1600])
+        hyperparams["keep_ratio"] = trial.suggest_categorical("keep_ratio", [0.02, 0.05, 0.1, 0.2])
+        hyperparams["action_coef"] = trial.suggest_float("action_coef", 0.05, 2.0, log=True)
+        hyperparams["kl_coef"] = trial.suggest_float("kl_coef", 1e-4, 0.05, log=True)
+        sizes = {name: trial.suggest_categorical(name, [16, 32, 64]) for name in _SIZES}
+        hyperparams["policy_kwargs"] = {**hyperparams["policy_kwargs"], **sizes}
+        return hyperparams
+
+    return sample, convert
+
+
+def _reading_our_files(manager_class: Any) -> Any:
+    """
+    :param manager_class: rl_zoo3's ``ExperimentManager``
+    :return: a subclass of it that reads our YAML files for our algorithms
+    """
+
+    class ExperimentManager(manager_class):
+        """rl_zoo3's, which reads our YAML files for our algorithms."""
+
+        config: str
+
+        def __init__(self, args: Any, algo: str, *others: Any, config: str | None = None, **kwargs: Any) -> None:
+            if algo in ALGOS and config is None:
+                config = str(find_config_file(algo))
+            super().__init__(args, algo, *others, config=config, **kwargs)
+
+        def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+            given = self.config
+            if self.algo not in ALGOS or Path(given).suffix not in (".yml", ".yaml"):
+                return super().read_hyperparameters()
+            print(f"Reading for rl_zoo3: {given}")
+            sections = {name: section or {} for name, section in read_file(Path(given)).items()}
+            default = sections.get(DEFAULT, {})
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / Path(given).name
+                # What rl_zoo3's reader would take for texts is written out as numbers
+                path.write_text(yaml.safe_dump({name: merge(default, section) for name, section in sections.items()}))
+                self.config = str(path)
+                try:
+                    return super().read_hyperparameters()
+                finally:
+                    self.config = given
+
+        def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+            if self.algo in ALGOS:
+                hyperparams = self._read_texts(hyperparams)
+            return super()._preprocess_hyperparams(hyperparams)
+
+        def _read_texts(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
+            """
+            :return: with schedules and classes in place of their names; what is an object already stays as it is
+            """
+            algo_class, place = ALGOS[self.algo], Place(self.config)
+            arguments, _ = parameters(algo_class)
+            read = {
+                key: check_value(value, arguments[key], place.key(key))
+                if isinstance(value, str) and key in arguments and key not in _READ_BY_ZOO
+                else value
+                for key, value in hyperparams.items()
+            }
+            policy_class = algo_class.policy_aliases.get(read.get("policy", ""))
+            if isinstance(read.get("policy_kwargs"), dict) and policy_class is not None:
+                arguments, _ = parameters(policy_class)
+                read["policy_kwargs"] = {
+                    key: check_value(value, arguments.get(key, Any), place.key("policy_kwargs").key(key))
+                    if isinstance(value, str)
+                    else value
+                    for key, value in read["policy_kwargs"].items()
+                }
+            return read
+
+    return ExperimentManager
