@@ -188,18 +188,19 @@ def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterabl
 
 
 def play_all(
-    names: Iterable[str], beliefs: Iterable[str], seeds: Iterable[int], jobs: int = 1
+    names: Iterable[str], beliefs: Iterable[str], seeds: Iterable[int], jobs: int = 1, rollouts: int | None = None
 ) -> dict[tuple[str, str], list[Played]]:
     """
     :param names: Keys of ``GAMES``
     :param beliefs: Variants, of those that each game is played with
     :param seeds: Of the runs
     :param jobs: Processes
+    :param rollouts: How many rollouts are trained, instead of the games'
     :return: ``{(game, variant): [result of each seed]}``
     """
     beliefs, seeds = list(beliefs), list(seeds)
     pairs = [(name, belief) for name in names for belief in GAMES[name].beliefs if belief in beliefs]
-    runs = [(name, belief, seed) for name, belief in pairs for seed in seeds]
+    runs = [(name, belief, seed, rollouts) for name, belief in pairs for seed in seeds]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         results = list(pool.map(play, *zip(*runs, strict=True)))
     return {pair: results[i * len(seeds) : (i + 1) * len(seeds)] for i, pair in enumerate(pairs)}

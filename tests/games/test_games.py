@@ -29,25 +29,26 @@ def test_a_belief_follows_a_leader_whom_no_weights_can_know():
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    """All the games that the tests below look at, two processes at a time where there are two cores."""
+    """The games that the tests below look at, two at a time where there are two cores."""
     played: dict[tuple[str, str], list[Played]] = {}
 
     def get(game: str, belief: str) -> list[Played]:
         if (game, belief) not in played:
-            wanted = [b for b in PLAYED[game] if b in GAMES[game].beliefs]
-            played.update(play_all([game], wanted, SEEDS, jobs=os.cpu_count() or 1))
+            beliefs, rollouts = next(part for part in PLAYED[game] if belief in part[0])
+            played.update(play_all([game], beliefs, SEEDS, jobs=os.cpu_count() or 1, rollouts=rollouts))
         return played[game, belief]
 
     return get
 
 
-PLAYED: dict[str, tuple[str, ...]] = {
-    "swap": BELIEFS,
-    "watch-act": ("dynamic", "none"),
-    "redraw": ("dynamic", "none"),
-    "redraw-each": BELIEFS,
-    "hidden": HISTORY,
-    "stationary": ("dynamic", "none"),
+# Which variants play a game, and for how many rollouts: fewer than in the YAML entry where there is nothing to be learned
+PLAYED: dict[str, list[tuple[tuple[str, ...], int | None]]] = {
+    "swap": [(HISTORY, None), (tuple(belief for belief in BELIEFS if belief not in HISTORY), 25)],
+    "watch-act": [(("dynamic", "none"), None)],
+    "redraw": [(("dynamic", "none"), None)],
+    "redraw-each": [(BELIEFS, 30)],
+    "hidden": [(HISTORY, 30)],
+    "stationary": [(("dynamic", "none"), None)],
 }
 
 
