@@ -71,9 +71,9 @@ def test_rewards_and_leader_step_by_step(kwargs):
         counts = rules.rewarded == "always" or age % life >= life - rules.rollout_steps
         assert rewards == {"follower": float(counts and action == convention[cue])}
         assert env.scripted_actions() == {"leader": convention[cue]}
-        assert terminations == {"follower": False} and infos == {"follower": {}}
+        assert truncations == {"follower": False} and infos == {"follower": {}}
         over = age % rules.rollout_steps == rules.rollout_steps - 1
-        assert truncations == {"follower": over} and env.agents == ([] if over else ["follower"])
+        assert terminations == {"follower": over} and env.agents == ([] if over else ["follower"])
         n_rewarded += rewards["follower"] > 0
         if not np.array_equal(env.convention, convention):
             assert rules.K is not None and (age + 1) % life == 0
@@ -196,7 +196,7 @@ def test_a_batch_equals_single_copies_bit_for_bit(kwargs, n_envs):
         obs, rewards, dones, infos = env.step({"follower": actions})
         assert rewards.dtype == np.float32 and obs["follower"].dtype == np.int64
         for i, single in enumerate(singles):
-            single_obs, single_rewards, _, truncations, _ = single.step({"follower": int(actions[i])})
+            single_obs, single_rewards, terminations, _, _ = single.step({"follower": int(actions[i])})
             info = infos[i]
             assert rewards[i] == single_rewards["follower"] and info["agent_rewards"].tolist() == [rewards[i]]
             assert info["agent_rewards"].dtype == info["scripted_actions"].dtype == np.float32
@@ -205,11 +205,11 @@ def test_a_batch_equals_single_copies_bit_for_bit(kwargs, n_envs):
                 info["scripted_actions"], spaces.flatten(leader, single.scripted_actions()["leader"])
             )
             assert info["visible"].tolist() == [single.visibility()["follower"].tolist()]
-            assert info["active"].tolist() == [True] and info["life_end"].tolist() == [False]
-            assert info["truncated"].tolist() == [dones[i]] == [truncations["follower"]]
+            assert info["active"].tolist() == [True] and info["truncated"].tolist() == [False]
+            assert info["life_end"].tolist() == [dones[i]] == [terminations["follower"]]
             if dones[i]:
                 assert (t + 1) % length == 0 and info["episode"]["l"] == length
-                assert info["TimeLimit.truncated"] is True
+                assert info["TimeLimit.truncated"] is False
                 assert info["terminal_observation"] == single_obs
                 single_obs = single.reset()[0]
             else:

@@ -42,9 +42,9 @@ class SwitchingConvention(ParallelEnv[str, int, int]):
     best. Read ``rollout/ep_rew_mean`` (of ``rollout_steps`` at most) and not an evaluation during training: an evaluation
     environment lives a life of its own, so its convention is not the one that the follower's history is of.
 
-    An episode is ``rollout_steps`` long and ends by a time limit (truncation). Conventions do not change with episodes but
-    every ``K * rollout_steps`` steps of the environment's life; a reset with a seed begins that life anew, one without a seed
-    goes on.
+    An episode is ``rollout_steps`` long and ends by termination: no step has consequences for a later one, so there is nothing
+    to bootstrap from. Conventions do not change with episodes but every ``K * rollout_steps`` steps of the environment's
+    life; a reset with a seed begins that life anew, one without a seed goes on.
 
     :param m: number of cues and of actions, >= 2
     :param K: number of rollouts for which a convention lives, >= 1; None: for ever
@@ -116,7 +116,7 @@ class SwitchingConvention(ParallelEnv[str, int, int]):
     ) -> tuple[dict[str, int], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """
         :param actions: the follower's action, in [0, m)
-        :return: next cue, reward, termination (False), truncation (True at the last step of an episode) and an empty info, by
+        :return: next cue, reward, termination (True at the last step of an episode), truncation (False) and an empty info, by
             agent
         :raises ValueError: if the action is missing or there is no such action, or if no episode is under way
         """
@@ -132,7 +132,7 @@ class SwitchingConvention(ParallelEnv[str, int, int]):
         if done:
             self.agents = []
         obs, reward = {FOLLOWER: int(self.game.cue[0])}, {FOLLOWER: float(rewards[0])}
-        return obs, reward, {FOLLOWER: False}, {FOLLOWER: done}, {FOLLOWER: {}}
+        return obs, reward, {FOLLOWER: done}, {FOLLOWER: False}, {FOLLOWER: {}}
 
     def scripted_actions(self) -> dict[str, int]:
         """

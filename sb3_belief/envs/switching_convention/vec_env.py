@@ -37,10 +37,10 @@ class SwitchingConventionVecEnv(TeamVecEnv):
         self._always = {
             "visible": np.array([[self.config.leader_visible]]),
             "active": np.ones(1, dtype=bool),
-            "life_end": np.zeros(1, dtype=bool),
+            "truncated": np.zeros(1, dtype=bool),
         }
-        self._limits = np.zeros(1, dtype=bool), np.ones(1, dtype=bool)
-        for shared in (*self._always.values(), *self._limits):
+        self._ends = np.zeros(1, dtype=bool), np.ones(1, dtype=bool)
+        for shared in (*self._always.values(), *self._ends):
             shared.flags.writeable = False
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
@@ -61,14 +61,14 @@ class SwitchingConventionVecEnv(TeamVecEnv):
             raise ValueError(f"Actions must be integers from 0 to {self.config.m - 1}, got {np.unique(chosen).tolist()}.")
         rewards, dones = self.game.step(chosen)
         infos: list[dict[str, Any]] = [
-            {"agent_rewards": reward, "truncated": self._limits[done], "scripted_actions": scripted, **self._always}
+            {"agent_rewards": reward, "life_end": self._ends[done], "scripted_actions": scripted, **self._always}
             for reward, done, scripted in zip(rewards[:, None], dones.tolist(), self._one_hot[self.game.leader], strict=True)
         ]
         cues = self.game.cue
         ended = np.flatnonzero(dones)
         if len(ended):
             for copy in ended:
-                infos[copy]["TimeLimit.truncated"] = True
+                infos[copy]["TimeLimit.truncated"] = False
                 infos[copy]["terminal_observation"] = {FOLLOWER: cues[copy]}
             self.game.reset(ended)
             cues = self.game.cue
