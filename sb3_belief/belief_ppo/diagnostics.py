@@ -10,7 +10,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_belief.belief import ActionLayout, kl_divergence
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
-from sb3_belief.belief_ppo.extractor import BeliefFusion
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
 # Enough for two digits, and a small part of an update's time
@@ -43,14 +43,16 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     flat = policy.flat_observations(observations)
 
     belief, variant = policy.belief, policy.options.variant
-    assert belief is not None and variant is not None and isinstance(policy.mlp_extractor, BeliefFusion)
+    assert belief is not None and variant is not None
+    assert isinstance(policy.mlp_extractor, BeliefFusion) and isinstance(policy.features_extractor, BeliefExtractor)
     measured = dict(
         visible_fraction=float(minibatch.others_visible.float().mean()),
         fusion_ratio=policy.mlp_extractor.belief_share(),
         first_log_ratio=_first_log_ratio(policy, buffer, step, observations, minibatch),
         history_gain=0.0,
     )
-    output = belief(flat, policy.history, minibatch.noise, minibatch.kept)
+    # The rollout has encoded the history already
+    output = policy.features_extractor.infer(flat, minibatch.noise, minibatch.kept)
     if variant.samples:
         measured["kl"] = float(kl_divergence(output.mean, output.log_std))
     if variant.attends:

@@ -144,13 +144,15 @@ def is_installed(module: str) -> bool:
     return found is not None
 
 
-def nearest(given: object, names: Iterable[str]) -> str:
+def nearest(given: object, names: Iterable[str], most: int = 3, cutoff: float = 0.4) -> str:
     """
     :param given: what was typed
     :param names: what could have been
+    :param most: how many names are suggested at most
+    :param cutoff: how alike they must be, in [0, 1]
     :return: `` Did you mean 'x'?`` (with the leading space), or nothing if none is near
     """
-    near = difflib.get_close_matches(str(given), list(names), n=3, cutoff=0.4)
+    near = difflib.get_close_matches(str(given), list(names), n=most, cutoff=cutoff)
     return f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 

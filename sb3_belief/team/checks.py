@@ -32,18 +32,6 @@ def check_wrappers(env: Any) -> None:
         env = vars(env).get("env") or vars(env).get("aec_env")
 
 
-def check_observation_kind(agent: str, space: Any) -> None:
-    """
-    :param agent: its name
-    :param space: its observation space; a nested one is not looked at here
-    :raises ValueError: if it is none that a model can take
-    """
-    allowed = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-    if not isinstance(space, (*allowed, spaces.Dict, spaces.Tuple)):
-        names = ", ".join(kind.__name__ for kind in allowed)
-        raise ValueError(f"The observation space of {agent!r} is {space}; allowed are {names}.")
-
-
 def check_names(
     agents: Sequence[str], before: Iterable[str], after: Iterable[str], given: Mapping[str, Mapping[str, Any]], where: str
 ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_belief.team.checks import check_names, check_observation, check_observation_kind, check_wrappers, place
+from sb3_belief.team.checks import check_names, check_observation, check_wrappers, place
 from sb3_belief.team.scripted import ScriptedOthers, optional_member
 
 Flags: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -49,8 +49,8 @@ class JointEnv(gym.Env):
         ``make_team_env``
     :param copy: number of this copy, for messages
     :raises TypeError: if it is not a ``ParallelEnv``, or is wrong about its scripted others
-    :raises ValueError: for SuperSuit's black_death, for an observation space of a kind that is not supported, and for
-        ``visibility`` if the environment has a method ``visibility()`` itself
+    :raises ValueError: for SuperSuit's black_death, and for ``visibility`` if the environment has a method ``visibility()``
+        itself
     """
 
     def __init__(self, env: ParallelEnv, visibility: Visibility | None = None, copy: int = 0):
@@ -64,8 +64,6 @@ class JointEnv(gym.Env):
         self.possible_agents: list[str] = list(env.possible_agents)
         self.observation_spaces = {agent: env.observation_space(agent) for agent in self.possible_agents}
         self.action_spaces = {agent: env.action_space(agent) for agent in self.possible_agents}
-        for agent, space in self.observation_spaces.items():
-            check_observation_kind(agent, space)
         self.observation_space = spaces.Dict(self.observation_spaces)
         self.action_space = spaces.Dict(self.action_spaces)
         self.render_mode = getattr(env, "render_mode", None)

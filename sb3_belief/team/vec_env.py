@@ -264,24 +264,25 @@ def check_spaces(
         missing, unknown = _difference(agents, given)
         if missing or unknown:
             raise ValueError(f"{name} must have a space for each of {agents}: missing {missing}, unknown {unknown}.")
+    allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+    kinds = ", ".join(kind.__name__ for kind in allowed)
     for agent in agents:
         if isinstance(observation_spaces[agent], (spaces.Dict, spaces.Tuple)):
             raise ValueError(
                 f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
                 " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
             )
+        if not isinstance(observation_spaces[agent], allowed):
+            raise ValueError(f"The observation space of {agent!r} is {observation_spaces[agent]}; allowed are {kinds}.")
     both = [name for name in scripted_action_spaces if name in agents]
     if both:
         raise ValueError(
             f"scripted_action_spaces has entries for {both}, which are agents: a scripted other does not learn, so its name"
             f" must differ from the agents' {list(agents)}."
         )
-    allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
     for name, space in {**action_spaces, **scripted_action_spaces}.items():
         if not isinstance(space, allowed):
-            raise ValueError(
-                f"The action space of {name!r} is {space}; allowed are {', '.join(kind.__name__ for kind in allowed)}."
-            )
+            raise ValueError(f"The action space of {name!r} is {space}; allowed are {kinds}.")
         if np.any(getattr(space, "start", 0)):
             raise ValueError(
                 f"The action space of {name!r} is {space}: SB3 numbers actions from 0, so the environment must too (start=0)."

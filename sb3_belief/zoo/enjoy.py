@@ -57,7 +57,7 @@ def enjoy(options: EnjoyOptions) -> Outcome:
     if options.output is not None and Path(options.output).suffix.lower() not in VIDEO_FORMATS:
         raise ConfigError(f"--output: {options.output!r} must end in {' or '.join(VIDEO_FORMATS)}.")
     path = find_team(options.run, "enjoy")
-    config = _config_of(path, options)
+    config, frame_rate = _config_of(path, options)
     env = _make_env(config, options)
     try:
         team = Team.load(path, env=env, device=options.device)
@@ -66,8 +66,7 @@ def enjoy(options: EnjoyOptions) -> Outcome:
         frames: list[np.ndarray] | None = None if options.output is None else []
         outcome = _play(team, env, options, frames)
         if options.output is not None and frames:
-            fps = options.fps or _frame_rate(config)
-            write_video(Path(options.output), frames, fps)
+            write_video(Path(options.output), frames, options.fps or frame_rate)
             print(f"Wrote {len(frames)} frames to {options.output}")
     finally:
         env.close()
@@ -93,15 +92,10 @@ def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
         imageio.mimsave(path, frames, fps=fps, macro_block_size=2)  # type: ignore[arg-type]
 
 
-def _frame_rate(config: RunConfig) -> int:
-    # SB3's vectorised environments do not pass this on
-    env = _make_one(config)
-    rate = env.metadata.get("render_fps", 10)
-    env.close()
-    return int(rate)
-
-
-def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
+def _config_of(team: Path, options: EnjoyOptions) -> tuple[RunConfig, int]:
+    """
+    :return: the run's configuration, with a render mode if there are pictures, and how many of them make a second
+    """
     run = run_of(team)
     if run is None:
         raise ConfigError(
@@ -113,12 +107,14 @@ def _config_of(team: Path, options: EnjoyOptions) -> RunConfig:
     env = _make_one(config)
     arguments, open_ended = parameters(spec(config.env_id).load())
     has_pictures = render_mode in env.metadata.get("render_modes", []) and (open_ended or "render_mode" in arguments)
+    # SB3's vectorised environments do not pass this on
+    frame_rate = int(env.metadata.get("render_fps", 10))
     env.close()
     if has_pictures:
-        return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode})
+        return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode}), frame_rate
     if options.output is not None:
         raise ConfigError(f"enjoy: {config.env_id} has no pictures to write to {options.output!r}; leave out --output.")
-    return config
+    return config, frame_rate
 
 
 def _make_one(config: RunConfig) -> Any:

@@ -1,7 +1,8 @@
 """What a user sees when a setting is refused."""
 
-import difflib
 from collections.abc import Iterable
+
+from sb3_belief.envs import families
 
 
 class ConfigError(ValueError):
@@ -14,8 +15,7 @@ def nearest(given: object, allowed: Iterable[str]) -> str:
     :param allowed: what could have been typed
     :return: `` Did you mean 'x'?`` (with the leading space), or nothing if no name is near
     """
-    near = difflib.get_close_matches(str(given), list(allowed), n=2, cutoff=0.5)
-    return f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+    return families.nearest(given, allowed, most=2, cutoff=0.5)
 
 
 def unknown(where: str, kind: str, given: object, allowed: Iterable[str]) -> ConfigError:

@@ -1,7 +1,6 @@
 """Gymnasium environments of several agents: tuples of spaces, of observations and of actions, one entry per agent."""
 
 import copy
-import difflib
 import operator
 import warnings
 from collections.abc import Sequence
@@ -11,13 +10,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
-from pettingzoo import ParallelEnv
+
+from sb3_belief.envs.base import TeamGame
+from sb3_belief.envs.families import nearest
 
 _SEQUENCES = (list, tuple, np.ndarray)
 Step = tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 
 
-class GymTupleEnv(ParallelEnv[str, np.ndarray, Any]):
+class GymTupleEnv(TeamGame[np.ndarray, Any]):
     """
     A Gymnasium environment whose observation and action spaces are ``Tuple``s, one entry for each agent, as a PettingZoo one.
 
@@ -109,20 +110,6 @@ class GymTupleEnv(ParallelEnv[str, np.ndarray, Any]):
 
     # PettingZoo's interface
 
-    def observation_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: space of its observations
-        """
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: space of its actions
-        """
-        return self.action_spaces[agent]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -148,8 +135,7 @@ class GymTupleEnv(ParallelEnv[str, np.ndarray, Any]):
         :raises ValueError: if an agent's action is missing or not in its space, if no episode is under way, or if the
             environment returns something else than Gymnasium's five, with one observation and reward for each agent
         """
-        if not self.agents:
-            raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
+        self._require_episode()
         was_in_play = self._in_play
         obs, reward, terminated, truncated, self.info = self.gym_env.step(self._joint_action(actions))
         self._steps += 1
@@ -290,9 +276,9 @@ def make_registered(package: str, id: str, known: Sequence[str], **env_kwargs: A
     :raises ValueError: for an unknown id, naming the nearest ones
     """
     if id not in known:
-        near = difflib.get_close_matches(id, known, n=3, cutoff=0.4)
-        hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
-        raise ValueError(f"{package} has no environment {id!r}.{hint} It has {len(known)}, such as {known[0]!r}.")
+        raise ValueError(
+            f"{package} has no environment {id!r}.{nearest(id, known)} It has {len(known)}, such as {known[0]!r}."
+        )
     found = gym.spec(id)
     creator: Any = found.entry_point if callable(found.entry_point) else load_env_creator(str(found.entry_point))
     with warnings.catch_warnings():

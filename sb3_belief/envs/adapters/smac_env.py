@@ -6,7 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
+
+from sb3_belief.envs.base import UnitsGame, check_render_mode, require_render_mode
 
 RENDER_MODES = ("human", "rgb_array")
 NO_OP = 0
@@ -14,7 +15,7 @@ NO_OP = 0
 ATTEMPTS = 3
 
 
-class StarCraft(ParallelEnv[str, np.ndarray, int]):
+class StarCraft(UnitsGame[np.ndarray]):
     """
     A team of units in StarCraft II against its built-in opponent, through the interface that SMAC and SMACv2 have in common.
 
@@ -44,9 +45,7 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
     metadata: ClassVar[dict[str, Any]] = {"name": "starcraft", "render_modes": list(RENDER_MODES), "is_parallelizable": True}
 
     def __init__(self, name: str, launch: Callable[[int | None], Any], extra_width: int = 0, render_mode: str | None = None):
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode={render_mode!r} is not one of None, {', '.join(map(repr, RENDER_MODES))}.")
-        self.render_mode = render_mode
+        self.render_mode = check_render_mode(render_mode, RENDER_MODES)
         self.name, self._launch = name, launch
         self.game: Any = launch(None)
         info = self.game.get_env_info()
@@ -65,20 +64,6 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
         self._obs = np.zeros((n_agents, self.width), dtype=np.float32)
         self._masks = np.ones((n_agents, self.n_actions), dtype=bool)
         self._visible = np.zeros((n_agents, n_agents - 1), dtype=bool)
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its observation space
-        """
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its action space
-        """
-        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,8 +116,7 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
         :return: observations, rewards, terminations, truncations and infos, by agent
         :raises ValueError: if an agent's action is missing, outside its space or impossible now, or if no episode is under way
         """
-        if not self.agents:
-            raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
+        self._require_episode()
         alive = ~self._masks[:, NO_OP]
         joint = [self._action_of(i, agent, actions) for i, agent in enumerate(self.possible_agents)]
         reward, ended, told = self.game.step(joint)
@@ -173,13 +157,6 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
         """
         return dict(zip(self.possible_agents, self._visible, strict=True))
 
-    def team_reward(self, rewards: dict[str, float]) -> float:
-        """
-        :param rewards: what ``step`` returned
-        :return: the reward that all of them have in common
-        """
-        return rewards[self.possible_agents[0]]
-
     def versions(self) -> dict[str, str]:
         """
         Results are to be compared within one version of StarCraft II only.
@@ -196,9 +173,7 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
         :return: what the package's renderer returns
         :raises ValueError: if the environment was made without a render mode
         """
-        if self.render_mode is None:
-            raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {RENDER_MODES}.")
-        return self.game.render(mode=self.render_mode)
+        return self.game.render(mode=require_render_mode(self.render_mode, RENDER_MODES))
 
     def close(self) -> None:
         """End StarCraft II; ``reset`` launches it again."""
@@ -224,13 +199,7 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
         return dict(zip(self.possible_agents, rows, strict=True))
 
     def _action_of(self, i: int, agent: str, actions: dict[str, int]) -> int:
-        if agent not in actions:
-            raise ValueError(f"No action for {agent!r}: every agent needs one at each step, also a dead one.")
-        action = actions[agent]
-        if not self.action_spaces[agent].contains(action):
-            raise ValueError(
-                f"The action of {agent!r} is {action!r}; allowed are the integers from 0 to {self.n_actions - 1}."
-            )
+        action = self._chosen(agent, actions)
         if self._masks[i, NO_OP]:
             return NO_OP
         if not self._masks[i, action]:
@@ -238,7 +207,7 @@ class StarCraft(ParallelEnv[str, np.ndarray, int]):
                 f"{agent!r} cannot do action {action} now, possible are {np.flatnonzero(self._masks[i]).tolist()}. StarCraft"
                 " takes no others, so it needs a learner that heeds action masks: MaskableBeliefPPO or MaskablePPO."
             )
-        return int(action)
+        return action
 
 
 def checked(name: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -4,16 +4,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
 from sb3_belief.envs.adapters.smax_core import Battles
 from sb3_belief.envs.adapters.smax_program import BattleConfig
 from sb3_belief.envs.adapters.smax_rendering import draw
+from sb3_belief.envs.base import UnitsGame, check_render_mode, require_render_mode
 
 RENDER_MODES = ("rgb_array",)
 
 
-class Smax(ParallelEnv[str, np.ndarray, int]):
+class Smax(UnitsGame[np.ndarray]):
     """
     One battle of allies, the agents, against SMAX's scripted enemies.
 
@@ -44,7 +44,7 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
     }
 
     def __init__(self, map_name: str, observe_last_actions: bool = False, render_mode: str | None = None, **options: Any):
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = check_render_mode(render_mode, RENDER_MODES)
         self.battles = Battles(1, BattleConfig.of(map_name, observe_last_actions, options))
         self.possible_agents = list(self.battles.agents)
         self.agents: list[str] = []
@@ -55,20 +55,6 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
             agent: spaces.Discrete(self.battles.n_actions) for agent in self.possible_agents
         }
         self._visible = np.zeros((len(self.possible_agents), len(self.possible_agents) - 1), dtype=bool)
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its observation space
-        """
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its action space
-        """
-        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -94,9 +80,8 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
         :return: observations, rewards, terminations, truncations and infos, by agent
         :raises ValueError: if an agent's action is missing or outside its space, or if no episode is under way
         """
-        if not self.agents:
-            raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
-        result = self.battles.step(np.array([[self._action_of(agent, actions) for agent in self.possible_agents]]))
+        self._require_episode()
+        result = self.battles.step(np.array([[self._chosen(agent, actions) for agent in self.possible_agents]]))
         self._visible = result.visible[0]
         ended, cut = bool(result.ended[0]), bool(result.cut[0])
         masks = self.battles.masks[:, 0]
@@ -123,13 +108,6 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
         """
         return dict(zip(self.possible_agents, self._visible, strict=True))
 
-    def team_reward(self, rewards: dict[str, float]) -> float:
-        """
-        :param rewards: what ``step`` returned
-        :return: the reward that all of them have in common
-        """
-        return rewards[self.possible_agents[0]]
-
     def get_state(self) -> dict[str, Any]:
         """
         :return: all that decides how the episode and those after it go on, as arrays and plain data
@@ -152,8 +130,7 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
         :return: a picture of the battlefield, uint8 [height, width, 3]
         :raises ValueError: if the environment was made without a render mode
         """
-        if self.render_mode is None:
-            raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {RENDER_MODES}.")
+        require_render_mode(self.render_mode, RENDER_MODES)
         return draw(self.battles, 0)
 
     def close(self) -> None:
@@ -161,16 +138,6 @@ class Smax(ParallelEnv[str, np.ndarray, int]):
 
     def _observe(self) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, self.battles.observations[:, 0], strict=True))
-
-    def _action_of(self, agent: str, actions: dict[str, int]) -> int:
-        if agent not in actions:
-            raise ValueError(f"No action for {agent!r}: every agent needs one at each step, also a dead one.")
-        action = actions[agent]
-        if not self.action_spaces[agent].contains(action):
-            raise ValueError(
-                f"The action of {agent!r} is {action!r}; allowed are the integers from 0 to {self.battles.n_actions - 1}."
-            )
-        return int(action)
 
 
 def observation_space(battles: Battles) -> spaces.Box:
@@ -180,14 +147,3 @@ def observation_space(battles: Battles) -> spaces.Box:
     """
     # Nearly all values are in [-1, 1]; who is pushed over the border of the map has a position just outside
     return spaces.Box(-np.inf, np.inf, (battles.width,), dtype=np.float32)
-
-
-def check_render_mode(render_mode: str | None) -> str | None:
-    """
-    :param render_mode: what the user gave
-    :return: the same
-    :raises ValueError: if there is no such mode
-    """
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r} is not one of None, {', '.join(map(repr, RENDER_MODES))}.")
-    return render_mode

@@ -7,9 +7,10 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_belief.envs.adapters.smax_core import Battles
-from sb3_belief.envs.adapters.smax_env import check_render_mode, observation_space
+from sb3_belief.envs.adapters.smax_env import RENDER_MODES, observation_space
 from sb3_belief.envs.adapters.smax_program import BattleConfig
 from sb3_belief.envs.adapters.smax_rendering import draw
+from sb3_belief.envs.base import check_render_mode
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
 
 
@@ -44,7 +45,7 @@ class SmaxVecEnv(TeamVecEnv):
             agents,
             {agent: observation_space(self.battles) for agent in agents},
             {agent: spaces.Discrete(self.battles.n_actions) for agent in agents},
-            render_mode=check_render_mode(render_mode),
+            render_mode=check_render_mode(render_mode, RENDER_MODES),
         )
         self._no_flags, self._all_flags = np.zeros(len(agents), dtype=bool), np.ones(len(agents), dtype=bool)
         for shared in (self._no_flags, self._all_flags):

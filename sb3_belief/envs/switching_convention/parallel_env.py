@@ -4,14 +4,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
+from sb3_belief.envs.base import TeamGame
 from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
 
 FOLLOWER, LEADER = "follower", "leader"
 
 
-class SwitchingConvention(ParallelEnv[str, int, int]):
+class SwitchingConvention(TeamGame[int, int]):
     """
     A follower sees a cue x, uniform of m, and at the same time a scripted leader plays c(x): c, the convention, is a
     permutation of range(m). The follower is rewarded with 1 if it played the same, else with 0. What the leader did is never
@@ -83,20 +83,6 @@ class SwitchingConvention(ParallelEnv[str, int, int]):
         """
         return self.game.conventions[0].copy()
 
-    def observation_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: Discrete(m), the cues
-        """
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: Discrete(m)
-        """
-        return self.action_spaces[agent]
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, int], dict[str, dict[str, Any]]]:
@@ -120,8 +106,7 @@ class SwitchingConvention(ParallelEnv[str, int, int]):
             agent
         :raises ValueError: if the action is missing or there is no such action, or if no episode is under way
         """
-        if not self.agents:
-            raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
+        self._require_episode()
         if FOLLOWER not in actions:
             raise ValueError(f"No action for {FOLLOWER!r}, the one who acts here; got actions for {list(actions)}.")
         action = actions[FOLLOWER]

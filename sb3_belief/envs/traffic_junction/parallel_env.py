@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
+from sb3_belief.envs.base import TeamGame, check_render_mode, require_render_mode
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
@@ -14,7 +14,7 @@ from sb3_belief.envs.traffic_junction.rendering import Renderer
 RENDER_MODES = ("human", "rgb_array")
 
 
-class TrafficJunction(ParallelEnv[str, np.ndarray, int]):
+class TrafficJunction(TeamGame[np.ndarray, int]):
     """
     Traffic Junction (Sukhbaatar et al. 2016, https://arxiv.org/abs/1605.07736): cars cross a junction that they see only
     3x3 cells of. Each follows its route and decides at each step only whether to drive on (0, gas) or to wait (1, brake).
@@ -85,7 +85,7 @@ class TrafficJunction(ParallelEnv[str, np.ndarray, int]):
         render_mode: str | None = None,
     ):
         self.config = JunctionConfig(level, order, reward, arrival_rate, reward_scale, vision, observe_last_actions)
-        self.render_mode = check_render_mode(render_mode)
+        self.render_mode = check_render_mode(render_mode, RENDER_MODES)
         self.core = TrafficCore(1, self.config)
         self._observer = Observer(self.core)
         self._renderer: Renderer | None = None
@@ -97,20 +97,6 @@ class TrafficJunction(ParallelEnv[str, np.ndarray, int]):
         n_cars = len(self.possible_agents)
         self._sees_now = np.zeros((1, n_cars, n_cars), dtype=bool)
         self._saw = np.zeros((1, n_cars, n_cars), dtype=bool)
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its observation space
-        """
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Space:
-        """
-        :param agent: its name
-        :return: its action space, Discrete(2): 0 gas, 1 brake
-        """
-        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -139,8 +125,7 @@ class TrafficJunction(ParallelEnv[str, np.ndarray, int]):
         :return: observations, rewards, terminations (all False), truncations (all True at the step limit) and infos, by agent
         :raises ValueError: if an agent's action is missing or neither 0 nor 1, or if no episode is under way
         """
-        if not self.agents:
-            raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
+        self._require_episode()
         joint = np.array([[self._action_of(agent, actions) for agent in self.possible_agents]])
         self._saw = self._sees_now
         result = self.core.step(joint)
@@ -211,11 +196,10 @@ class TrafficJunction(ParallelEnv[str, np.ndarray, int]):
         :raises ValueError: if the environment was made without a render mode
         :raises ImportError: if pygame is not installed
         """
-        if self.render_mode is None:
-            raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {RENDER_MODES}.")
+        mode = require_render_mode(self.render_mode, RENDER_MODES)
         if self._renderer is None:
             self._renderer = Renderer(self.core.layout, self.core.max_steps)
-        if self.render_mode == "human":
+        if mode == "human":
             self._renderer.show(self.core, 0, fps=self.metadata["render_fps"])
             return None
         return self._renderer.image(self.core, 0)
@@ -253,14 +237,3 @@ def action_masks(core: TrafficCore) -> np.ndarray:
     :return: which actions are possible now, bool [n_copies, n_cars, 2]: a slot without a car may only brake
     """
     return np.stack([core.on_road, np.ones_like(core.on_road)], axis=-1)
-
-
-def check_render_mode(render_mode: str | None) -> str | None:
-    """
-    :param render_mode: what the user gave
-    :return: the same
-    :raises ValueError: if there is no such mode
-    """
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r} is not one of None, {', '.join(map(repr, RENDER_MODES))}.")
-    return render_mode

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_belief.envs.base import check_render_mode, require_render_mode
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, Step, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
@@ -14,7 +15,6 @@ from sb3_belief.envs.traffic_junction.parallel_env import (
     TrafficJunction,
     action_masks,
     agent_names,
-    check_render_mode,
 )
 from sb3_belief.envs.traffic_junction.rendering import Renderer
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
@@ -46,7 +46,7 @@ class TrafficJunctionVecEnv(TeamVecEnv):
             agents,
             {agent: layout.space() for agent in agents},
             {agent: spaces.Discrete(2) for agent in agents},
-            render_mode=check_render_mode(render_mode),
+            render_mode=check_render_mode(render_mode, RENDER_MODES),
         )
         self._sees_now = np.zeros((num_envs, len(agents), len(agents)), dtype=bool)
         self._no_life_end = np.zeros((num_envs, len(agents)), dtype=bool)
@@ -141,9 +141,7 @@ class TrafficJunctionVecEnv(TeamVecEnv):
         :return: the pictures of all copies as tiles of one, or None if the first copy is shown in a window
         :raises ValueError: if there is no render mode
         """
-        mode = check_render_mode(mode or self.render_mode)
-        if mode is None:
-            raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {RENDER_MODES}.")
+        mode = require_render_mode(check_render_mode(mode or self.render_mode, RENDER_MODES), RENDER_MODES)
         if mode == "human":
             # SB3's own window needs OpenCV
             self._get_renderer().show(self.core, 0, fps=TrafficJunction.metadata["render_fps"])
