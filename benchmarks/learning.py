@@ -1,48 +1,151 @@
 """
-Train the full YAML entry of an environment with several seeds and measure the final teams, greedy, on episodes of their own.
+Train the full YAML entry of an environment with several beliefs and seeds, side by side, and measure the final teams on
+episodes of their own.
 
-    python benchmarks/learning.py --algos belief_ppo ippo --seeds 0 1 2
+    python benchmarks/learning.py --env traffic-junction-medium --beliefs dynamic none --seeds 0 1 2
+    python benchmarks/learning.py --env lbf/Foraging-2s-8x8-2p-2f-coop-v3 --plot lbf.png
+    python benchmarks/learning.py --algo maskable_belief_ppo --env smax/3m --quantity success --plot 3m.png
 
-prints a row per run: success rate over 1,024 episodes with its standard error, return, CPU seconds and the run's folder.
+prints a row per run: joint steps; over 1,024 episodes the return and the success rate of the policies as they are (sampled),
+then greedy; CPU seconds of the training, and the run's folder. Belief "none" is IPPO. A run that is already finished in the
+log folder is not trained again, so that a long comparison can be made in pieces; `--plot` draws all of them.
 """
 
 import argparse
+import json
 import time
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
 
-from sb3_belief.zoo.config import load_config
+from sb3_belief.belief_ppo.options import BELIEFS
+from sb3_belief.report.comparison import QUANTITIES, plot_comparison
+from sb3_belief.team import Team
+from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.evaluate import evaluate
+from sb3_belief.zoo.run_folder import folder_name
 from sb3_belief.zoo.train import TrainOptions, make_env, train
 
 # Episodes that neither the training nor its evaluations see
 MEASURE_SEED = 9_000_000
+_COLUMNS = (
+    f"{'belief':<12} {'seed':>4} {'joint steps':>12}   "
+    f"{'sampled':>8} {'success':<15} {'greedy':>8} {'success':<15} {'CPU s':>6}  folder"
+)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """
+    :param belief: what was trained
+    :param seed: of the run
+    :param timesteps: joint steps it was trained for
+    :param sampled: mean return, success rate and its standard error (None where the environment does not say)
+    :param greedy: the same of the most likely actions
+    :param seconds: CPU seconds of the training
+    :param folder: of the run
+    """
+
+    belief: str
+    seed: int
+    timesteps: int
+    sampled: tuple[float, float | None, float | None]
+    greedy: tuple[float, float | None, float | None]
+    seconds: float
+    folder: str
+
+    def __str__(self) -> str:
+        text = f"{self.belief:<12} {self.seed:>4} {self.timesteps:>12,}  "
+        for mean, success, error in (self.sampled, self.greedy):
+            text += f" {mean:>8.3f} {'-' if success is None else f'{success:.3f} ± {error:.3f}':<15}"
+        return f"{text} {self.seconds:>6.0f}  {self.folder}"
+
+
+def learn(
+    belief: str, seed: int, algo: str, env_id: str, n_timesteps: int | None, episodes: int, log_folder: str
+) -> Learned | None:
+    """
+    :param belief: a variant of the belief
+    :param seed: of team and environment
+    :param algo: algorithm, one with a belief
+    :param env_id: environment
+    :param n_timesteps: joint steps, None for the YAML entry's
+    :param episodes: episodes of each measure
+    :param log_folder: folder of all runs
+    :return: what came of it, None if it was interrupted
+    """
+    config = load_config(algo, env_id, params=[f"belief:{belief}"], n_timesteps=n_timesteps)
+    # What a result belongs to: a changed entry is another run
+    name = f"{algo}-{folder_name(env_id)}-{belief}-{config.n_timesteps}-{seed}"
+    path = Path(log_folder, "learning", f"{name}.json")
+    if path.is_file():
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["config"] == config.to_yaml():
+            return Learned(**record["learned"])
+    start = time.process_time()
+    # No evaluations on the way: they would count as training time
+    result = train(config, TrainOptions(seed=seed, log_folder=log_folder, eval_freq=-1, verbose=0))
+    seconds = time.process_time() - start
+    if not result.finished:
+        return None
+    sampled, greedy = (_measure(config, result.team, episodes, deterministic) for deterministic in (False, True))
+    learned = Learned(belief, seed, result.team.num_timesteps, sampled, greedy, seconds, str(result.folder))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"config": config.to_yaml(), "learned": asdict(learned)}, indent=2), encoding="utf-8")
+    return learned
+
+
+def _measure(config: RunConfig, team: Team, episodes: int, deterministic: bool) -> tuple[float, float | None, float | None]:
+    env = make_env(config, 64, MEASURE_SEED)
+    outcome = evaluate(team, env, episodes, deterministic)
+    env.close()
+    return float(outcome.returns.mean()), outcome.success_rate, outcome.standard_error
+
+
+def compare(beliefs: Iterable[str], seeds: Iterable[int], jobs: int, **settings: object) -> list[Learned]:
+    """
+    :param beliefs: variants
+    :param seeds: of the runs of each
+    :param jobs: processes
+    :param settings: see ``learn``
+    :return: all that were finished; each is printed when it is there
+    """
+    pairs = [(belief, seed) for belief in beliefs for seed in seeds]
+    run = partial(learn, **settings)  # type: ignore[arg-type]
+    learned = []
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(run, *zip(*pairs, strict=True)):
+            if result is not None:
+                print(result, flush=True)
+                learned.append(result)
+    return learned
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algos", nargs="+", default=["belief_ppo", "ippo"])
+    parser.add_argument("--algo", default="belief_ppo", choices=["belief_ppo", "maskable_belief_ppo"])
     parser.add_argument("--env", default="traffic-junction-medium")
+    parser.add_argument("--beliefs", nargs="+", default=["dynamic", "none", "wide"], choices=BELIEFS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("-n", "--n-timesteps", type=int, help="joint steps, instead of the YAML entry's")
     parser.add_argument("--episodes", type=int, default=1024)
     parser.add_argument("-f", "--log-folder", default="logs")
+    parser.add_argument("--plot", help="picture of the learning curves to write")
+    parser.add_argument("--quantity", default="return", choices=list(QUANTITIES), help="what it shows")
     args = parser.parse_args()
 
-    print("algo        seed  joint steps  success          return  CPU s  folder", flush=True)
-    for algo in args.algos:
-        config = load_config(algo, args.env, n_timesteps=args.n_timesteps)
-        for seed in args.seeds:
-            start = time.process_time()
-            # No evaluations on the way: they would count as training time
-            result = train(config, TrainOptions(seed=seed, log_folder=args.log_folder, eval_freq=-1, verbose=0))
-            seconds = time.process_time() - start
-            if not result.finished:
-                return
-            env = make_env(config, 64, MEASURE_SEED)
-            outcome = evaluate(result.team, env, args.episodes)
-            env.close()
-            success = "-" if outcome.success_rate is None else f"{outcome.success_rate:.3f} ± {outcome.standard_error:.3f}"
-            row = f"{algo:<10} {seed:>5} {result.team.num_timesteps:>12,}  {success:<15} {outcome.returns.mean():>7.2f}"
-            print(f"{row} {seconds:>6.0f}  {result.folder}", flush=True)
+    print(_COLUMNS, flush=True)
+    settings = dict(algo=args.algo, env_id=args.env, n_timesteps=args.n_timesteps)
+    results = compare(args.beliefs, args.seeds, args.jobs, **settings, episodes=args.episodes, log_folder=args.log_folder)
+    if args.plot:
+        runs = {belief: [r.folder for r in results if r.belief == belief] for belief in args.beliefs}
+        n_seeds = len(args.seeds)
+        title = f"{args.env}: mean of {n_seeds} seeds, and lowest to highest"
+        print(plot_comparison(runs, args.plot, args.quantity, title=title))
 
 
 if __name__ == "__main__":

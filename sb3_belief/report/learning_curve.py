@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,30 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[ends] - sums[starts]) / (ends - starts)
 
 
+def new_axes(title: str, unit: str) -> tuple[Any, Any]:
+    """
+    :param title: what stands above
+    :param unit: what the y axis shows
+    :return: matplotlib's figure and axes for curves over joint steps
+    :raises ImportError: if matplotlib is not installed
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("Plots need matplotlib: pip install 'sb3-belief[plots]'.") from error
+    # not pyplot: no global state and no backend, so it draws on any machine
+    figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel("joint steps of the team")
+    axes.set_ylabel(unit)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value >= 1000 else f"{value:g}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", alpha=0.2)
+    if title:
+        axes.set_title(title, loc="left", fontsize=11, color=INK)
+    return figure, axes
+
+
 def plot_learning_curve(
     folder: str | os.PathLike[str],
     output: str | os.PathLike[str],
@@ -75,11 +100,6 @@ def plot_learning_curve(
     :raises ImportError: if matplotlib is not installed
     :raises ValueError: if the run has not finished an episode
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("Plots need matplotlib: pip install 'sb3-belief[plots]'.") from error
-
     steps, returns, successes = read_monitor(folder)
     if not len(steps):
         raise ValueError(f"No episode ended in {os.fspath(folder)!r}: nothing to draw.")
@@ -87,9 +107,7 @@ def plot_learning_curve(
     values = successes if tells_success else returns
     window = max(1, min(500, len(values) // 10))
 
-    # not pyplot: no global state and no backend, so it draws on any machine
-    figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_axes(title, "success rate" if tells_success else "team return per episode")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
     evaluations = read_evaluations(folder)
     if evaluations is not None:
@@ -107,17 +125,10 @@ def plot_learning_curve(
             fontsize=9,
             color=INK,
         )
-    axes.set_xlabel("joint steps of the team")
-    axes.set_ylabel("success rate" if tells_success else "team return per episode")
     if tells_success:
         axes.set_ylim(-0.02, 1.02)
     axes.set_xlim(0, steps[-1])
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value >= 1000 else f"{value:g}")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", alpha=0.2)
     axes.legend(frameon=False, loc="best", fontsize=9)
-    if title:
-        axes.set_title(title, loc="left", fontsize=11, color=INK)
     path = Path(output)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
