@@ -47,8 +47,7 @@ def cross_entropy(prediction: th.Tensor, actions: th.Tensor, visible: th.Tensor,
 
 
 def _mean_over_visible(errors: th.Tensor, visible: th.Tensor, layout: ActionLayout) -> th.Tensor:
-    owners = th.as_tensor(layout.owners, device=errors.device)
-    return (errors * visible[:, owners]).sum() / visible.sum().clamp(min=1)
+    return (errors * visible[:, layout.owner_index(errors.device)]).sum() / visible.sum().clamp(min=1)
 
 
 #: By the name that ``action_loss`` has for it
@@ -64,7 +63,8 @@ def kl_divergence(mean: th.Tensor, log_std: th.Tensor) -> th.Tensor:
     :param log_std: ``[B, z]``
     :return: A scalar, at least zero
     """
-    return 0.5 * (mean.square() + (2 * log_std).exp() - 1 - 2 * log_std).sum(dim=1).mean()
+    log_variance = 2 * log_std
+    return 0.5 * (mean.square() + log_variance.expm1() - log_variance).sum(dim=1).mean()
 
 
 def expected_actions(prediction: th.Tensor, layout: ActionLayout, action_loss: str) -> th.Tensor:

@@ -13,6 +13,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_belief.belief.attention import attend
 from sb3_belief.belief.history import History
 from sb3_belief.belief.variants import VARIANTS
 
@@ -128,7 +129,9 @@ class DynamicBelief(nn.Module):
         :return: Its filled rows as directions, keys and values
         """
         rows = history.filled()
-        embeddings = self.observation_embedding(rows.observations)
+        return self._encode(rows, self.observation_embedding(rows.observations))
+
+    def _encode(self, rows: History, embeddings: th.Tensor) -> HistoryContext:
         states = embeddings + self.action_embedding(rows.actions)
         directions = self._direction(rows.observations, embeddings)
         return HistoryContext(directions, self.key(states), self.value(states))
@@ -152,12 +155,19 @@ class DynamicBelief(nn.Module):
         :return: The belief and all that belongs to it
         :raises ValueError: if a variant that attends is given no history, or more rows are to be kept than it has
         """
-        embedding = self.observation_embedding(observations)
+        if self.variant.attends and context is None:
+            if history is None:
+                raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
+            # In one pass with the observations: few large matrix products are faster than many small ones
+            rows = history.filled()
+            embedding, embeddings = self.observation_embedding(th.cat([observations, rows.observations])).split(
+                [len(observations), len(rows.observations)]
+            )
+            context = self._encode(rows, embeddings)
+        else:
+            embedding = self.observation_embedding(observations)
         if self.variant.attends:
-            if context is None:
-                if history is None:
-                    raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
-                context = self.encode_history(history)
+            assert context is not None
             if kept is None:
                 kept = self._most_similar(observations, embedding, context)
             summary, weights = self._attend(embedding, context, kept)
@@ -198,8 +208,4 @@ class DynamicBelief(nn.Module):
             raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(context.keys)}; keep at most as many")
         if kept.shape[1] == 0:
             return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
-        scores = self.query(embedding) @ context.keys.T / math.sqrt(self.embedding_dim)
-        weights = scores.gather(1, kept).softmax(dim=1)
-        # Spreading the weights over all rows and multiplying is faster than gathering a value for each of them
-        spread = th.zeros_like(scores).scatter(1, kept, weights)
-        return spread @ context.values, weights
+        return attend(self.query(embedding), context.keys, context.values, kept, 1 / math.sqrt(self.embedding_dim))

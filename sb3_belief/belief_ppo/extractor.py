@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -23,9 +24,22 @@ def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
     return observation.flatten(1).float()
 
 
+class BeliefFeatures(NamedTuple):
+    """
+    What policy and value are computed from. Two tensors instead of one: SB3 only passes them on, and the features of most
+    observations need no gradient, which they would get in one tensor with the belief.
+
+    :param own: Features of the observation, ``[B, features]``
+    :param latent: The belief about the others, ``[B, z]``
+    """
+
+    own: th.Tensor
+    latent: th.Tensor
+
+
 class BeliefExtractor(BaseFeaturesExtractor):
     """
-    Features of the observation and, beside them, the belief about the others: ``[B, features + z]``.
+    Features of the observation and, beside them, the belief about the others: :class:`BeliefFeatures`.
 
     The history belongs to the weights: it is kept in buffers, and so is saved, loaded and moved with the policy. How the
     belief is drawn is said by :meth:`conditioned`; without it the belief is its mean.
@@ -94,7 +108,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
         finally:
             self._given = (None, None, False)
 
-    def forward(self, observations: th.Tensor | TensorDict) -> th.Tensor:
+    def forward(self, observations: th.Tensor | TensorDict) -> BeliefFeatures:
         noise, kept, sample = self._given
         flat = flatten_observation(observations)
         if sample and self.belief.variant.samples:
@@ -105,7 +119,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
         if self.options.detach_belief:
             latent = latent.detach()
-        return th.cat([self.features(observations), latent], dim=1)
+        return BeliefFeatures(self.features(observations), latent)
 
     def infer(self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None) -> BeliefOutput:
         """
@@ -162,20 +176,18 @@ class BeliefFusion(nn.Module):
         self.fuse_vf = nn.Linear(self.latent_dim_vf + latent_dim, self.latent_dim_vf, device=device)
         self.activation = fusion_activation_fn()
 
-    def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def forward(self, features: BeliefFeatures) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: Output of :class:`BeliefExtractor`
         :return: Latent codes of policy and value
         """
         return self.forward_actor(features), self.forward_critic(features)
 
-    def forward_actor(self, features: th.Tensor) -> th.Tensor:
-        own, latent = features[:, : -self.latent_dim], features[:, -self.latent_dim :]
-        return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(own), latent], dim=1)))
+    def forward_actor(self, features: BeliefFeatures) -> th.Tensor:
+        return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(features.own), features.latent], dim=1)))
 
-    def forward_critic(self, features: th.Tensor) -> th.Tensor:
-        own, latent = features[:, : -self.latent_dim], features[:, -self.latent_dim :]
-        return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(own), latent], dim=1)))
+    def forward_critic(self, features: BeliefFeatures) -> th.Tensor:
+        return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(features.own), features.latent], dim=1)))
 
     def belief_share(self) -> float:
         """

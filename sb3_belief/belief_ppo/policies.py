@@ -30,6 +30,18 @@ else:
 _MIN_IMAGE_SIZE = 36
 
 
+def _fast_adam(optimizer_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
+    """
+    One call for all weights instead of ten for each of these many small ones: the same step to the last bits, faster.
+
+    :param optimizer_kwargs: What the user says of Adam; None: SB3's default
+    :return: The same with the fused implementation, unless the user has chosen another
+    """
+    given = {"eps": 1e-5} if optimizer_kwargs is None else dict(optimizer_kwargs)
+    chosen = given.keys() & {"fused", "foreach", "capturable", "differentiable"}
+    return given if chosen else {**given, "fused": True}
+
+
 class BeliefPolicyMixin(_Policy):
     """
     Makes an SB3 actor-critic policy one with a belief. All of SB3's own passes (`forward`, `evaluate_actions`,
@@ -95,6 +107,8 @@ class BeliefPolicyMixin(_Policy):
         if features_extractor_class is None:
             features_extractor_class = self.default_extractor or fitting_extractor(observation_space)
         kwargs["features_extractor_class"] = features_extractor_class
+        if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
+            kwargs["optimizer_kwargs"] = _fast_adam(kwargs.get("optimizer_kwargs"))
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         if self.has_belief and not self.share_features_extractor:
             raise ValueError(

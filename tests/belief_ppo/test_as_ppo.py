@@ -17,6 +17,9 @@ from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from tests.belief_ppo.helpers import ROLLOUT, SMALL, VARIANTS, make_model
 from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
 
+# With the same implementation of Adam, stock algorithms are equal to the last bit
+OUR_ADAM = dict(optimizer_kwargs=dict(eps=1e-5, fused=True))
+
 
 @pytest.mark.parametrize("belief", ["none", "dynamic"])
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -41,7 +44,7 @@ def of_stock_and_ours(env_kwargs, belief):
     """MaskablePPO and ours on the same environment, after three iterations."""
     envs = [make_vec_env(MaskedAmongOthers, n_envs=2, seed=0, env_kwargs=env_kwargs) for _ in range(2)]
     kwargs: dict[str, Any] = dict(n_steps=12, batch_size=8, n_epochs=3, seed=3, device="cpu")
-    stock = MaskablePPO("MlpPolicy", envs[0], **kwargs).learn(3 * 24)
+    stock = MaskablePPO("MlpPolicy", envs[0], policy_kwargs=OUR_ADAM, **kwargs).learn(3 * 24)
     ours = MaskableBeliefPPO("BeliefPolicy", envs[1], belief=belief, **kwargs)
     before = [parameter.detach().clone() for parameter in ours.policy.parameters()]
     ours.learn(3 * 24)
@@ -59,6 +62,20 @@ def test_maskable_without_others_is_maskable_ppo():
     with pytest.warns(UserWarning, match="MaskableBeliefPPO is MaskablePPO here"):
         expected, found = of_stock_and_ours(dict(others={}), "dynamic")
     assert expected.keys() == found.keys() and all(th.equal(value, found[name]) for name, value in expected.items())
+
+
+@pytest.mark.parametrize(
+    "given, used",
+    [
+        (None, dict(eps=1e-5, fused=True)),
+        (dict(eps=1e-3), dict(eps=1e-3, fused=True)),
+        (dict(foreach=True), dict(foreach=True, fused=None)),
+        (dict(fused=False), dict(fused=False)),
+    ],
+)
+def test_adam_is_the_fused_one_unless_the_user_says_otherwise(given, used):
+    model = make_model(policy_kwargs=dict(optimizer_kwargs=given))
+    assert {key: model.policy.optimizer.defaults[key] for key in used} == used
 
 
 class Solo(gym.Wrapper):
@@ -83,7 +100,7 @@ def test_every_variant_is_ppo_where_there_are_no_others(belief, names_nobody):
         ours = BeliefPPO("BeliefPolicy", make_env(), belief=belief, **SMALL).learn(2 * 28)
     assert len(caught) == 1
     stock = {k: v for k, v in SMALL.items() if k not in ("history_length", "keep_ratio")}
-    ppo = PPO("MlpPolicy", make_env(), **stock).learn(2 * 28)
+    ppo = PPO("MlpPolicy", make_env(), policy_kwargs=OUR_ADAM, **stock).learn(2 * 28)
     found = dict(ours.policy.named_parameters())
     assert all(th.equal(value, found[name]) for name, value in ppo.policy.named_parameters())
     assert ours.policy.belief is None and ours.policy.history is None

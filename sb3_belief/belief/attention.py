@@ -1,0 +1,59 @@
+"""Attention to a few selected rows (eq. 4 of the paper), with a backward pass of its own."""
+
+from typing import Any
+
+import torch as th
+import torch.nn.functional as F
+
+
+def attend(
+    queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Each query's mean of the values of its kept rows, weighted by a softmax over the scaled products with their keys.
+
+    :param queries: ``[B, d]``
+    :param keys: ``[T, d]``
+    :param values: ``[T, d]``
+    :param kept: The rows that each query attends to, no row twice, long ``[B, N]``, N at least 1
+    :param scale: What the products are multiplied by
+    :return: The weighted sums ``[B, d]``, and the weights ``[B, N]``, which are to be looked at: no gradient flows from them
+    """
+    return _Attend.apply(queries, keys, values, kept, scale)
+
+
+class _Attend(th.autograd.Function):
+    """
+    Softmax attention with the usual gradient. Written out because the graph that PyTorch would record is half as fast: it
+    keeps and passes through several [B, T] matrices, of which the backward pass here needs one. Products with all rows are
+    dense matrix products (on a CPU these are faster than gathering [B, N, d]); sums over the kept rows are `embedding_bag`,
+    which touches no other. benchmarks/attention.py measures it against both alternatives.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float
+    ) -> tuple[th.Tensor, th.Tensor]:
+        weights = (queries @ keys.T).gather(1, kept).mul_(scale).softmax(dim=1)
+        ctx.save_for_backward(queries, keys, values, kept, weights)
+        ctx.scale = scale
+        ctx.mark_non_differentiable(weights)
+        return _sum_kept(values, kept, weights), weights
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        queries, keys, values, kept, weights = ctx.saved_tensors
+        grad_sums = grad_outputs[0]
+        dense = grad_sums @ values.T
+        grad_weights = dense.gather(1, kept)
+        grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True)) * ctx.scale
+        # One matrix for both sums over the queries: the second fills the places of the first
+        dense = dense.zero_().scatter_(1, kept, weights)
+        grad_values = dense.T @ grad_sums
+        grad_keys = dense.scatter_(1, kept, grad_scores).T @ queries
+        return _sum_kept(keys, kept, grad_scores), grad_keys, grad_values, None, None
+
+
+def _sum_kept(rows: th.Tensor, kept: th.Tensor, weights: th.Tensor) -> th.Tensor:
+    """Sums of the kept rows by these weights, ``[B, d]``."""
+    return F.embedding_bag(kept, rows, per_sample_weights=weights, mode="sum")
