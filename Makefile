@@ -9,8 +9,9 @@ SOURCES := sb3_belief tests benchmarks train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 CONFORMANCE_ARGS ?=
+BENCH_ARGS ?=
 
-.PHONY: help install demo test test-slow test-smax pytest conformance lint type format check-codestyle commit-checks clean
+.PHONY: help install demo test test-slow test-smax pytest conformance bench lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -42,6 +43,9 @@ pytest: test
 conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our algorithms in place of theirs
 	$(BIN)/python -m tests.conformance.fetch
 	$(BIN)/python -m tests.conformance.run $(CONFORMANCE_ARGS)
+
+bench: $(STAMP)  ## measure speed and memory (ten minutes), into benchmarks/out/bench.json
+	$(BIN)/python -m benchmarks.bench $(BENCH_ARGS)
 
 # SMAX has an environment of its own: jaxmarl needs gymnasium<1.4, and its pins are those of Python 3.11
 $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt

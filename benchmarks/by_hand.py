@@ -1,0 +1,121 @@
+"""
+Three stock PPOs that learn on mpe2's simple_spread by a program of their own: what a team is compared with.
+
+- ``ByHand`` steps the same vectorised environment as the team: the difference is what lockstep and SB3's own rollout cost
+- ``Bare`` steps bare environments of just this kind (all agents always in play, one action type, every end a time limit, no
+  visibility, no infos): the difference is what a team costs altogether against a program for one environment only
+"""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch as th
+from mpe2 import simple_spread_v3
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+
+from sb3_belief.team import make_team_env
+from sb3_belief.team.lockstep import Lockstep
+
+Advance = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, dict[int, dict[str, np.ndarray]]]
+
+
+class ByHand:
+    """
+    The policies, buffers and ``train()`` of three stock PPOs, with the loop over steps written out.
+
+    :param n_envs: number of copies
+    :param settings: arguments of PPO
+    """
+
+    def __init__(self, n_envs: int, settings: dict[str, Any]) -> None:
+        self.n_envs = n_envs
+        self.env = make_team_env(simple_spread_v3.parallel_env, n_envs=n_envs, seed=0)
+        self.agents = self.env.possible_agents
+        # Only for the models' spaces; it is never stepped
+        hub = Lockstep(make_team_env(simple_spread_v3.parallel_env, n_envs=n_envs))
+        self.models: dict[str, PPO] = {}
+        for k, agent in enumerate(self.agents):
+            model = PPO("MlpPolicy", hub.agent_envs[agent], seed=k, device="cpu", **settings)
+            model.set_logger(Logger(None, []))
+            self.models[agent] = model
+        self.obs = self._reset()
+        self.starts = np.ones(self.n_envs, dtype=bool)
+
+    def iterate(self) -> int:
+        """
+        :return: joint steps of one rollout and the update after it
+        """
+        n_steps = next(iter(self.models.values())).n_steps
+        for model in self.models.values():
+            model.policy.set_training_mode(False)
+            model.rollout_buffer.reset()
+        for _ in range(n_steps):
+            self._step()
+        for agent, model in self.models.items():
+            with th.no_grad():
+                values = model.policy.predict_values(th.as_tensor(self.obs[agent]))
+            model.rollout_buffer.compute_returns_and_advantage(values, self.starts)
+            model.logger.dump()
+            model.train()
+        return n_steps * self.n_envs
+
+    def _step(self) -> None:
+        outputs, actions = {}, {}
+        with th.no_grad():
+            for agent, model in self.models.items():
+                outputs[agent] = model.policy(th.as_tensor(self.obs[agent]))
+                actions[agent] = outputs[agent][0].numpy()
+        next_obs, rewards, dones, terminal_obs = self._advance(actions)
+        for i in np.flatnonzero(dones).tolist():
+            for k, (agent, model) in enumerate(self.models.items()):
+                with th.no_grad():
+                    value = model.policy.predict_values(th.as_tensor(terminal_obs[i][agent][None]))
+                rewards[i, k] += model.gamma * float(value)
+        for k, (agent, model) in enumerate(self.models.items()):
+            _, values, log_probs = outputs[agent]
+            chosen = actions[agent].reshape(-1, 1)
+            model.rollout_buffer.add(self.obs[agent], chosen, rewards[:, k], self.starts, values, log_probs)
+            model.num_timesteps += self.n_envs
+        self.obs, self.starts = next_obs, dones
+
+    def _reset(self) -> dict[str, np.ndarray]:
+        return self.env.reset()
+
+    def _advance(self, actions: dict[str, np.ndarray]) -> Advance:
+        """
+        :return: next observations, rewards [n_envs, n], dones [n_envs] and of ended copies the last observations
+        """
+        obs, _, dones, infos = self.env.step(actions)
+        rewards = np.array([info["agent_rewards"] for info in infos])
+        return obs, rewards, dones, {i: infos[i]["terminal_observation"] for i in np.flatnonzero(dones).tolist()}
+
+
+class Bare(ByHand):
+    """The same loop over bare environments."""
+
+    def _reset(self) -> dict[str, np.ndarray]:
+        self.envs = [simple_spread_v3.parallel_env() for _ in range(self.n_envs)]
+        self.episodes: deque = deque(maxlen=100)
+        self.returns = np.zeros((self.n_envs, len(self.agents)))
+        observations = [env.reset(seed=i)[0] for i, env in enumerate(self.envs)]
+        return {agent: np.stack([obs[agent] for obs in observations]) for agent in self.agents}
+
+    def _advance(self, actions: dict[str, np.ndarray]) -> Advance:
+        next_obs = {agent: np.empty_like(obs) for agent, obs in self.obs.items()}
+        rewards = np.zeros((self.n_envs, len(self.agents)), dtype=np.float32)
+        dones = np.zeros(self.n_envs, dtype=bool)
+        terminal_obs = {}
+        for i, env in enumerate(self.envs):
+            obs, reward, _, _, _ = env.step({agent: int(actions[agent][i]) for agent in self.agents})
+            rewards[i] = [reward[agent] for agent in self.agents]
+            self.returns[i] += rewards[i]
+            if not env.agents:
+                dones[i], terminal_obs[i] = True, obs
+                self.episodes.append(self.returns[i].copy())
+                self.returns[i] = 0.0
+                obs, _ = env.reset()
+            for agent in self.agents:
+                next_obs[agent][i] = obs[agent]
+        return next_obs, rewards, dones, terminal_obs

@@ -1,0 +1,102 @@
+"""The benchmarks run and count right; how fast anything is, is never asserted."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import bench, heavy
+from benchmarks.measure import Sample, alternate, ratio, spread
+from benchmarks.report import BARS, Report
+
+AGENT_STEPS = 32
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    out = tmp_path_factory.mktemp("bench") / "out" / "bench.json"
+    bench.main(["--quick", "--parts", "a", "b", "c", "d", "cores", "--out", str(out)])
+    return json.loads(Path(out).read_text())
+
+
+def test_the_file_says_all_that_others_read(written):
+    assert written.keys() == {"ratios", "peak_mib", "versions", "details"}
+    assert written["ratios"].keys() == BARS.keys()
+    # these two are measured in parts that were not asked for, or not everywhere
+    unmeasured = {"workers_vs_ideal", "two_cores_vs_one"}
+    assert all(value > 0 for key, value in written["ratios"].items() if key not in unmeasured)
+    assert written["versions"]["torch"]
+    assert written["details"]["quick"] is True
+    for part in ("a", "b"):
+        time = written["details"]["time"][part]
+        assert time["belief_share_of_update"] < 1
+        for parts in time["ms_per_joint_step"].values():
+            assert {"environment", "transfer", "policy", "buffer", "update: backward", "rest"} <= parts.keys()
+            total = parts.pop("total")
+            assert sum(parts.values()) == pytest.approx(total)
+
+
+def test_steps_are_counted_as_they_were_done(written):
+    rows = {(row["part"], row["name"]): row["steps"] for row in written["details"]["rows"]}
+    spread_rows = [steps for (part, _), steps in rows.items() if part == "a"]
+    assert spread_rows == [[8 * 8]] * 5
+    junction_rows = [steps for (part, _), steps in rows.items() if part == "b"]
+    assert junction_rows == [[4 * 8]] * 2
+    for n in (5, 20):
+        for kind in ("fixed others", "all learn", "no belief"):
+            assert rows["agents", f"{n} agents, {kind}"] == [n * AGENT_STEPS]
+    for part, names in {
+        "copies": ("1 copies", "8 copies"),
+        "history": ("800 rows", "6400 rows"),
+        "others": ("5 others", "40 others"),
+    }.items():
+        for name in names:
+            assert rows[part, name] == [AGENT_STEPS]
+
+
+def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
+    order = []
+
+    def loop(name: str, steps: int) -> int:
+        order.append(name)
+        return steps
+
+    samples = alternate({"a": lambda: loop("a", 2), "b": lambda: loop("b", 3)}, rounds=3, warmup=1)
+    assert order == ["a", "b", "a", "b", "b", "a", "a", "b"]
+    assert [sample.steps for sample in samples["b"]] == [3, 3, 3]
+    # the machine was half as fast in the second round, for both
+    fast, slow = [Sample(100, 1.0, 2.0), Sample(100, 2.0, 4.0)], [Sample(100, 2.0, 2.0), Sample(100, 4.0, 4.0)]
+    assert ratio(fast, slow) == (2.0, 2.0, 2.0)
+    assert ratio(fast, slow, "wall") == (1.0, 1.0, 1.0)
+    assert spread([4.0, 1.0, 2.0, 3.0, 5.0]) == (3.0, 2.0, 4.0)
+
+
+def test_a_bar_that_is_missed_fails_nothing(capsys):
+    report = Report(rounds=1, quick=True)
+    report.add_ratio("lockstep_vs_hand", spread([0.5]), "this / that")
+    report.add_ratio("others_40_vs_5", spread([1.5]), "this / that")
+    assert "0.500 (0.500 to 0.500)   bar >= 0.97: missed" in (printed := capsys.readouterr().out)
+    assert "bar <= 1.5: met" in printed
+    assert report.ratios["lockstep_vs_hand"] == 0.5 and report.ratios["ippo_vs_hand"] is None
+
+
+def test_a_heavy_step_burns_its_own_time():
+    import time
+
+    env = heavy.HeavyEnv("burns")
+    env.reset()
+    start = time.process_time()
+    env.step({"agent_0": 0, "agent_1": 0})
+    assert time.process_time() - start >= heavy.SECONDS
+
+
+@pytest.mark.slow
+def test_memory_and_workers_are_measured(tmp_path):
+    out = tmp_path / "bench.json"
+    bench.main(["--quick", "--parts", "e", "workers", "--out", str(out)])
+    written = json.loads(out.read_text())
+    assert written["peak_mib"].keys() >= {"imports only", "junction belief_ppo"}
+    assert all(value > 50 for value in written["peak_mib"].values())
+    assert written["ratios"]["workers_vs_ideal"] > 0
+    steps = {row["name"]: row["steps"] for row in written["details"]["rows"]}
+    assert steps["burns, stepped"] == steps["sleeps, learning"] == [2 * 4]
