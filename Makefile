@@ -8,10 +8,13 @@ SMAX_STAMP := $(SMAX_VENV)/.installed
 SOURCES := sb3_belief tests benchmarks train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+# As many tests at once as there are cores; PYTEST_JOBS=0 for one after the other
+PYTEST_JOBS ?= auto
 CONFORMANCE_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help install demo test test-slow test-smax pytest conformance bench lint type format check-codestyle commit-checks clean
+.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench lint type format check-codestyle \
+	commit-checks clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -32,7 +35,7 @@ demo: $(STAMP)  ## train a team of BeliefPPO agents on Traffic Junction and show
 	$(BIN)/sb3-belief demo $(DEMO_ARGS)
 
 test: $(STAMP)  ## run all tests but the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" $(PYTEST_ARGS)
 
 test-slow: $(STAMP)  ## play the games that prove the belief dynamic
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
@@ -53,6 +56,9 @@ $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
 	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt torch
 	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt -e . pytest jaxmarl 'gymnasium<1.4'
 	@touch $@
+
+test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from its package
+	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" tests/envs $(PYTEST_ARGS)
 
 test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
 	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/test_smax.py $(PYTEST_ARGS)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
@@ -74,6 +74,10 @@ class BeliefExtractor(BaseFeaturesExtractor):
         self.noise: th.Tensor | None = None
         self._given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
         self._context: tuple[tuple[tuple[int, int], ...], HistoryContext] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What the last pass left behind is made again where it is needed
+        return {**vars(self), "output": None, "noise": None, "_context": None}
 
     @property
     def history(self) -> History | None:

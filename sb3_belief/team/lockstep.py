@@ -16,43 +16,18 @@ is one thread and one order, the team's: runs are deterministic. Every agent dra
 
 import contextvars
 from copy import deepcopy
-from typing import Any
 
 import numpy as np
 import torch as th
 from greenlet import GreenletExit, getcurrent, greenlet
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.team.agent_vec_env import AgentVecEnv
-from sb3_belief.team.members import ACTS, COUNTED, FINISHED, ROLLOUT_ENDED, Member, Observer
+from sb3_belief.team.members import ACTS, COUNTED, FINISHED, ROLLOUT_ENDED, UPDATES, UPDATES_HERE, Barrier, Member, Observer
 from sb3_belief.team.notes import add_note
 from sb3_belief.team.streams import RandomStream, StreamSwitch
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
 from sb3_belief.team.views import AgentStep, TeamViews
-
-
-class _Barrier(CallbackList):
-    """
-    An agent's own callback, and then the wait for the others.
-
-    What runs at every step is written out: where there is no callback, SB3's own bookkeeping for one would be waste.
-    """
-
-    def __init__(self, hub: "Lockstep", agent: str, callback: BaseCallback | None):
-        super().__init__([] if callback is None else [callback])
-        self._hub, self._agent = hub, agent
-
-    def update_locals(self, locals_: dict[str, Any]) -> None:
-        for callback in self.callbacks:
-            callback.update_locals(locals_)
-
-    def on_step(self) -> bool:
-        return self._hub.vote(self._agent, super().on_step() if self.callbacks else True)
-
-    def _on_rollout_end(self) -> None:
-        super()._on_rollout_end()
-        self._hub.wait(self._agent, ROLLOUT_ENDED)
 
 
 class Lockstep:
@@ -85,6 +60,7 @@ class Lockstep:
         self._masks_known = False
         self._go_on = True
         self._vote = True
+        self._in_round = False
         self.n_steps = 0
         self.agent_envs = {agent: AgentVecEnv(self, agent) for agent in self.possible_agents}
 
@@ -160,6 +136,13 @@ class Lockstep:
         if th.is_grad_enabled() != grad_enabled:
             th.set_grad_enabled(grad_enabled)
 
+    def is_round_of(self, agent: str) -> bool:
+        """
+        :param agent: who is about to be updated
+        :return: whether it has ended its rollout and does so in its own ``learn()``, so that it can wait for others who do
+        """
+        return self._in_round and getcurrent() is self._members[agent].coroutine
+
     # For the team
 
     def reset(self) -> None:
@@ -193,7 +176,7 @@ class Lockstep:
                     self._stop_all(error)
                     raise
         finally:
-            self._main, self._members, self._parts, self._actions = None, {}, {}, {}
+            self._main, self._members, self._parts, self._actions, self._in_round = None, {}, {}, {}, False
 
     def _run(self, observer: Observer, stream: RandomStream, streams: StreamSwitch) -> bool:
         members = self._members
@@ -202,7 +185,7 @@ class Lockstep:
             # Greenlets start with an empty context; the caller's settings (e.g. np.errstate) hold for the agents too
             member.coroutine.gr_context = contextvars.copy_context()
             streams.to(member.stream)
-            self._resume(agent, _Barrier(self, agent, member.callback))
+            self._resume(agent, Barrier(self, agent, member.callback))
         # Who has ended a rollout since the team's last one ended
         ended: set[str] = set()
         learning, all_together = self._learning(), False
@@ -249,9 +232,16 @@ class Lockstep:
         if team_ended:
             ended.clear()
             observer.on_rollout_end()
-        for agent in now:
-            streams.to(self._members[agent].stream)
-            self._resume(agent)
+        self._in_round = True
+        turns = now
+        while turns:
+            for agent in turns:
+                streams.to(self._members[agent].stream)
+                self._resume(agent)
+            # With updates in several processes: first who is updated here, while the workers are busy, then all in their order
+            here = [agent for agent in now if self._members[agent].state == UPDATES_HERE]
+            turns = here or [agent for agent in now if self._members[agent].state == UPDATES]
+        self._in_round = False
         streams.to(stream)
         learning = self._learning()
         observer.on_round_end(learning)

@@ -2,17 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from greenlet import greenlet
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_belief.team.streams import RandomStream
 from sb3_belief.team.vec_env import TeamObs, TeamStep
 
+if TYPE_CHECKING:
+    from sb3_belief.team.lockstep import Lockstep
+
 # Why an agent's coroutine has switched to the hub
 ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
+# With updates in several processes: it is to be updated in this one, or waits for the others to be
+UPDATES_HERE, UPDATES = "updates here", "updates"
 
 
 @dataclass
@@ -32,6 +37,29 @@ class Member:
     callback: BaseCallback | None = None
     state: str = FINISHED
     coroutine: greenlet = field(init=False)
+
+
+class Barrier(CallbackList):
+    """
+    An agent's own callback, and then the wait for the others.
+
+    What runs at every step is written out: where there is no callback, SB3's own bookkeeping for one would be waste.
+    """
+
+    def __init__(self, hub: "Lockstep", agent: str, callback: BaseCallback | None):
+        super().__init__([] if callback is None else [callback])
+        self._hub, self._agent = hub, agent
+
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        for callback in self.callbacks:
+            callback.update_locals(locals_)
+
+    def on_step(self) -> bool:
+        return self._hub.vote(self._agent, super().on_step() if self.callbacks else True)
+
+    def _on_rollout_end(self) -> None:
+        super()._on_rollout_end()
+        self._hub.wait(self._agent, ROLLOUT_ENDED)
 
 
 class Observer(Protocol):

@@ -105,9 +105,15 @@ class ParallelTeamVecEnv(TeamVecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         return self.venv.get_images()
 
+    def has_attr(self, attr_name: str) -> bool:
+        # As SB3 asks worker processes, which do not survive being asked for the value of what they do not have
+        self._finish_interrupted_step()
+        return attr_name == "action_masks" or self.venv.has_attr(attr_name)
+
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         if attr_name == "action_masks":
             return super().get_attr(attr_name, indices)
+        self._finish_interrupted_step()
         return self.venv.get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -118,6 +124,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
     ) -> list[Any]:
         if method_name == "action_masks":
             return super().env_method(method_name, indices=indices)
+        self._finish_interrupted_step()
         return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
     def _reset_joint(self) -> TeamObs:

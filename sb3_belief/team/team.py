@@ -29,6 +29,7 @@ from sb3_belief.team.progress import TeamProgress, as_callback
 from sb3_belief.team.roster import Roster, team_stream
 from sb3_belief.team.saving import read_team, spaces_manifest, write_team
 from sb3_belief.team.streams import StreamSwitch
+from sb3_belief.team.updates import Updates, check_jobs
 from sb3_belief.team.vec_env import TeamObs
 
 SelfTeam = TypeVar("SelfTeam", bound="Team")
@@ -56,10 +57,14 @@ class Team:
     :param log_dir: folder of CSV logs: ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None: none
     :param tensorboard_log: folder of TensorBoard logs: ``Team_<k>`` and ``Team_<k>/agents/<agent>``; None: none
     :param device: of all models
+    :param jobs: how many processes update the agents whose algorithms are on-policy (PPO, A2C, ...) at once, this one among
+        them; with any number the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can
+        be imported (``if __name__ == "__main__":``); with ``torch.set_num_threads(1)`` each takes one core. ``train()`` of
+        an algorithm of one's own may read and change all of its model but the environment
     :param agent_kwargs: {agent: {argument: value}} for single agents, overriding ``kwargs``
     :param kwargs: further arguments of the algorithm class for all agents
     :raises TypeError: if ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
-    :raises ValueError: for unknown or missing agents
+    :raises ValueError: for unknown or missing agents, or if ``jobs`` is not a number of processes, or a model cannot use them
     """
 
     def __init__(
@@ -74,8 +79,10 @@ class Team:
         tensorboard_log: str | None = None,
         device: th.device | str = "auto",
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
+        jobs: int = 1,
         **kwargs: Any,
     ):
+        check_jobs(jobs)
         hub = Lockstep(check_env(env))
         agents = hub.possible_agents
         classes, policies = per_agent("algo_class", algo_class, agents), per_agent("policy", policy, agents)
@@ -83,7 +90,7 @@ class Team:
         check_names("agent_kwargs", own_kwargs, agents)
         recipes = {agent: (classes[agent], policies[agent], {**kwargs, **own_kwargs.get(agent, {})}) for agent in agents}
         roster = Roster.build(recipes, hub, seed, normalize, max(verbose - 1, 0), device)
-        self._setup(hub, roster, hub.scripted, seed, normalize, verbose, log_dir, tensorboard_log)
+        self._setup(hub, roster, hub.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
         if seed is not None:
             env.seed(seed)
 
@@ -97,6 +104,7 @@ class Team:
         verbose: int,
         log_dir: str | None,
         tensorboard_log: str | None,
+        jobs: int,
     ) -> None:
         self._hub = hub
         self._roster = roster
@@ -113,6 +121,7 @@ class Team:
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
         self._stream = team_stream(seed)
+        self._updates = Updates(roster.models, jobs)
         self._learning = False
         # False when the agents' last observations are not all those of where the environment is now
         self._can_continue = False
@@ -211,7 +220,8 @@ class Team:
                     hub.reset()
                 total = total_timesteps + self.num_timesteps
                 progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": hub.env})
-            in_step = hub.run(members, progress, self._stream)
+            with self._updates.together(hub):
+                in_step = hub.run(members, progress, self._stream)
             with StreamSwitch(self._stream):
                 progress.on_training_end()
             self._can_continue = in_step
@@ -284,6 +294,7 @@ class Team:
         verbose: int = 0,
         log_dir: str | None = None,
         tensorboard_log: str | None = None,
+        jobs: int = 1,
     ) -> SelfTeam:
         """
         :param path: of a saved team, with or without ".zip", or an open binary file
@@ -292,10 +303,12 @@ class Team:
         :param verbose: as for the constructor
         :param log_dir: as for the constructor
         :param tensorboard_log: as for the constructor
+        :param jobs: as for the constructor
         :return: the team; as with SB3 the random streams start anew from its seed
         :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged or no saved team, or if the environment does not fit it
+        :raises ValueError: if it is damaged or no saved team, if the environment does not fit it, or for wrong ``jobs``
         """
+        check_jobs(jobs)
         saved = read_team(path)
         hub = None if env is None else Lockstep(check_env(env))
         if hub is not None:
@@ -303,7 +316,7 @@ class Team:
         seed = saved.manifest["seed"]
         team = cls.__new__(cls)
         roster = Roster.load(saved, hub, seed=seed, device=device)
-        team._setup(hub, roster, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log)
+        team._setup(hub, roster, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
         team.num_timesteps = saved.manifest["num_timesteps"]
         if env is not None and seed is not None:
             env.seed(seed)

@@ -75,6 +75,12 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         "--vec-env", choices=["dummy", "subproc"], default="dummy", help="in this process, or a process per copy"
     )
     parser.add_argument("--num-threads", type=_positive_or_off, default=1, help="threads of torch, -1 for torch's own choice")
+    parser.add_argument(
+        "--jobs",
+        type=_positive,
+        default=1,
+        help="processes that update the agents at once; the same is learned with any number",
+    )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
     parser.add_argument("-i", "--trained-agent", help="a run's folder or a team's zip to go on from")
     parser.add_argument("--verbose", type=int, choices=[0, 1, 2], default=1, help="0 for silence, 1 for tables")
@@ -171,7 +177,7 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
         config = resume_config(args.trained_agent, args.algo, args.env, *rest)
     names = (
         "seed log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
-        " vec_env device num_threads progress trained_agent verbose"
+        " vec_env device num_threads jobs progress trained_agent verbose"
     )
     options = TrainOptions(**{name: getattr(args, name) for name in names.split()}, command=command)
     return 0 if train(config, options).finished else 130

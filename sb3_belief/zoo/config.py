@@ -33,11 +33,12 @@ RUN_KEYS: dict[str, Any] = {
     "policy_kwargs": dict[str, Any],
     "normalize": bool | dict[str, Any],
     "env_wrapper": str | list[Any] | dict[str, Any] | None,
+    "visibility": str | dict[str, Any] | None,
     "env_kwargs": dict[str, Any],
     "callback": str | list[Any] | dict[str, Any] | None,
 }
 # Naming these anew replaces what a lower layer named, instead of adding to it
-_REPLACED = ("env_wrapper", "callback")
+_REPLACED = ("env_wrapper", "visibility", "callback")
 
 _FLAGS = {
     "env": "use the flag --env",
@@ -68,6 +69,7 @@ class RunConfig:
     :param normalize: for ``Team(normalize=...)``
     :param env_kwargs: for ``make_team_env``
     :param wrapper: for ``make_team_env``: the wrappers named by ``env_wrapper``, or None
+    :param visibility: for ``make_team_env``: the function named by ``visibility``, or None
     :param callbacks: callback classes and their arguments
     :param algo_kwargs: constructor arguments of each agent's algorithm
     """
@@ -83,6 +85,7 @@ class RunConfig:
     normalize: bool | dict[str, Any] = False
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     wrapper: Callable[[Any], Any] | None = None
+    visibility: Callable[[Any], Any] | None = None
     callbacks: tuple[tuple[type[BaseCallback], dict[str, Any]], ...] = ()
     algo_kwargs: dict[str, Any] = field(default_factory=dict)
 
@@ -237,6 +240,11 @@ class _LayerChecker:
             return check_call(self.make_env, value, place, skip=self.n_leading)
         if key == "env_wrapper":
             return tuple(self._check_calls(value, place, skip=1))
+        if key == "visibility":
+            calls = self._check_calls(value, place, skip=1)
+            if len(calls) > 1:
+                raise ConfigError(f"{place.text}: must name one function, not {len(calls)}: there is one visibility.")
+            return partial(calls[0][0], **calls[0][1]) if calls else None
         if key == "callback":
             callbacks = tuple(self._check_calls(value, place))
             for callback, _ in callbacks:
@@ -246,7 +254,7 @@ class _LayerChecker:
         return value
 
     def _check_calls(self, value: Any, place: Place, skip: int = 0) -> list[tuple[Callable[..., Any], dict[str, Any]]]:
-        """``path``, ``{path: arguments}``, or a list of these."""
+        """``path``, ``{path: arguments, ...}``, or a list of these."""
         calls = []
         for item in value if isinstance(value, list) else [] if value is None else [value]:
             for path, arguments in item.items() if isinstance(item, dict) else [(item, None)]:
@@ -280,6 +288,7 @@ def _to_run_config(
         normalize=checked.get("normalize", False),
         env_kwargs=checked.get("env_kwargs", {}),
         wrapper=partial(_wrap, wrappers=wrappers) if wrappers else None,
+        visibility=checked.get("visibility"),
         callbacks=checked.get("callback", ()),
         algo_kwargs=algo_kwargs,
     )

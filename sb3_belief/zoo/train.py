@@ -20,6 +20,7 @@ from sb3_belief.zoo.run_folder import (
     CONFIG,
     TEAM,
     RunRecord,
+    environment_versions,
     find_team,
     folder_name,
     make_run_folder,
@@ -45,6 +46,7 @@ class TrainOptions:
     :param vec_env: ``"dummy"`` or ``"subproc"``
     :param device: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     :param num_threads: threads of torch, -1 for torch's own choice
+    :param jobs: processes that update the agents at once, see ``Team``
     :param progress: whether to show a progress bar
     :param trained_agent: a run's folder or a team's zip to go on from
     :param verbose: 0 for silence, 1 for tables
@@ -61,6 +63,7 @@ class TrainOptions:
     vec_env: str = "dummy"
     device: str = "auto"
     num_threads: int = 1
+    jobs: int = 1
     progress: bool = False
     trained_agent: str | None = None
     verbose: int = 1
@@ -120,11 +123,12 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             vec_env=options.vec_env,
             device=str(options.device),
             num_threads=th.get_num_threads(),
+            jobs=options.jobs,
         )
         env.start_monitor(str(folder))
         if options.verbose:
             print(f"Run folder: {folder}  (seed {seed})")
-        return _learn(team, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
+        return _learn(team, env, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
 
 
 def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
@@ -138,7 +142,13 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") 
     """
     try:
         return make_team_env(
-            config.env_id, n_envs=n_envs, seed=seed, vec_env=vec_env, env_kwargs=config.env_kwargs, wrapper=config.wrapper
+            config.env_id,
+            n_envs=n_envs,
+            seed=seed,
+            vec_env=vec_env,
+            env_kwargs=config.env_kwargs,
+            wrapper=config.wrapper,
+            visibility=config.visibility,
         )
     except (ValueError, TypeError, ImportError) as error:
         raise ConfigError(f"{config.source}: {config.env_id} refuses its settings: {error}") from error
@@ -154,7 +164,7 @@ def make_team(
 ) -> Team:
     """
     :param config: configuration
-    :param options: device, tables and TensorBoard folder are taken from them
+    :param options: device, tables, TensorBoard folder and jobs are taken from them
     :param env: what the team learns in
     :param seed: of the team
     :param trained: a saved team to load instead of making a new one
@@ -168,6 +178,7 @@ def make_team(
         and str(Path(options.tensorboard_log, config.algo, folder_name(config.env_id))),
         verbose=options.verbose,
         log_dir=None if folder is None else str(folder),
+        jobs=options.jobs,
     )
     try:
         if trained is not None:
@@ -215,7 +226,13 @@ def _callbacks(
 
 
 def _learn(
-    team: Team, config: RunConfig, options: TrainOptions, folder: Path, record: RunRecord, callbacks: list[BaseCallback]
+    team: Team,
+    env: TeamVecEnv,
+    config: RunConfig,
+    options: TrainOptions,
+    folder: Path,
+    record: RunRecord,
+    callbacks: list[BaseCallback],
 ) -> TrainResult:
     status = "failed"
     try:
@@ -232,7 +249,8 @@ def _learn(
     finally:
         if status != "failed":
             team.save(folder / TEAM)
-        record.finish(status, timesteps=team.num_timesteps)
+        told = {"environment": environment_versions(config.env_id, env)} if status != "failed" else {}
+        record.finish(status, timesteps=team.num_timesteps, **told)
     if options.verbose or status == "interrupted":
         print(f"{status.capitalize()} after {team.num_timesteps} joint steps. Saved: {folder / TEAM}")
     return TrainResult(folder, team, status == "finished")

@@ -102,6 +102,15 @@ def test_seed_is_used_once():
     assert np.array_equal(env.reset()["agent_0"], first["agent_0"])
 
 
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_asking_for_what_an_environment_lacks_harms_nobody(vec_env):
+    env = make_team_env(partial(ToyEnv, n_agents=2), n_envs=2, seed=0, vec_env=vec_env)
+    assert env.has_attr("positions") and env.has_attr("action_masks") and not env.has_attr("versions")
+    env.reset()
+    assert set(env.get_attr("positions")[1]) == {"agent_0", "agent_1"}
+    env.close()
+
+
 def test_observations_are_not_overwritten():
     class Frugal(ToyEnv):
         def observations(self):

@@ -7,12 +7,14 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn, optim
 
+from sb3_belief.envs.families import FAMILIES
 from sb3_belief.envs.registry import registered_ids
 from sb3_belief.zoo import config as config_module
 from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.config import REPO_CONFIGS, load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.names import ALGOS
+from sb3_belief.zoo.yaml_data import read_file
 
 EASY = "traffic-junction-easy"
 MEDIUM = "traffic-junction-medium"
@@ -30,9 +32,16 @@ def conf(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("env_id", registered_ids())
-@pytest.mark.parametrize("algo", ALGOS)
+def committed(algo):
+    """What its file has a section for, and what finds the default there."""
+    return sorted({*registered_ids(), *read_file(REPO_CONFIGS / f"{algo}.yml")} - {"default"})
+
+
+@pytest.mark.parametrize("algo, env_id", [(algo, env_id) for algo in ALGOS for env_id in committed(algo)])
 def test_every_committed_entry_is_valid(algo, env_id):
+    family = FAMILIES.get(env_id.partition("/")[0])
+    if family is not None and family.missing():
+        pytest.skip(f"needs {' and '.join(family.missing())}")
     config = load_config(algo, env_id)
     assert config.n_timesteps > 0
     # what the algorithm is given is what its constructor takes
@@ -43,11 +52,19 @@ def test_every_committed_file_belongs_to_an_algorithm():
     assert {path.stem for path in REPO_CONFIGS.glob("*.yml")} == set(ALGOS)
 
 
-def test_ippo_is_belief_ppo_without_the_belief():
-    belief, none = (load_config(algo, MEDIUM) for algo in ("belief_ppo", "ippo"))
+@pytest.mark.parametrize("env_id", [name for name in read_file(REPO_CONFIGS / "ippo.yml") if name != "default"])
+def test_ippo_is_belief_ppo_without_the_belief(env_id):
+    belief, none = (load_config(algo, env_id) for algo in ("belief_ppo", "ippo"))
     assert none.algo_class is belief.algo_class
+    # widths of the belief do nothing where there is none
+    network = belief.algo_kwargs["policy_kwargs"]
+    belief.algo_kwargs["policy_kwargs"] = {k: v for k, v in network.items() if k not in ("embedding_dim", "latent_dim")}
     assert none.algo_kwargs == {**belief.algo_kwargs, "belief": "none"}
     assert (none.n_envs, none.n_timesteps, none.env_kwargs) == (belief.n_envs, belief.n_timesteps, belief.env_kwargs)
+
+
+def test_ippo_has_the_sections_of_belief_ppo():
+    assert read_file(REPO_CONFIGS / "ippo.yml").keys() == read_file(REPO_CONFIGS / "belief_ppo.yml").keys()
 
 
 def test_sources_are_merged_in_order(conf):
@@ -247,6 +264,24 @@ def test_the_allow_list_is_extended_by_who_types_the_command(tmp_path, monkeypat
         load_config("ppo", EASY, params=params)
     wrapper = load_config("ppo", EASY, params=params, extra_packages=("junction_extras",)).wrapper
     assert wrapper is not None and wrapper("an env") == "an env"
+
+
+def test_visibility_is_a_function_with_its_arguments(tmp_path, monkeypatch):
+    (tmp_path / "junction_sight.py").write_text("def nearby(env, radius=1):\n    return env, radius\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def load(value):
+        return load_config("ppo", EASY, params=[f"visibility:{value}"], extra_packages=("junction_sight",))
+
+    assert load_config("ppo", EASY).visibility is None and load("null").visibility is None
+    sight = load("{junction_sight.nearby: {radius: 3}}").visibility
+    assert sight is not None and sight("an env") == ("an env", 3)
+    with pytest.raises(ConfigError, match=r"-params: visibility: junction_sight.nearby: unknown key 'radios'.*'radius'"):
+        load("{junction_sight.nearby: {radios: 3}}")
+    with pytest.raises(ConfigError, match=r"-params: visibility: must name one function, not 2"):
+        load("{junction_sight.nearby: {}, supersuit.dtype_v0: {dtype: int8}}")
+    with pytest.raises(ConfigError, match=r"'junction_sight.nearby' is not of an allowed package"):
+        load_config("ppo", EASY, params=["visibility:junction_sight.nearby"])
 
 
 def test_callbacks_are_named_with_their_arguments():

@@ -3,12 +3,14 @@ import json
 import os
 import signal
 import sys
+from importlib import metadata
 
 import numpy as np
 import pytest
 import yaml
 
 from sb3_belief.envs import TrafficJunction
+from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
 from sb3_belief.team import Team, make_team_env
 from sb3_belief.zoo.cli import main, train_main
 
@@ -190,6 +192,29 @@ def test_wrappers_change_what_the_agents_see(tmp_path):
     output = tmp_path / "episode.gif"
     assert main(["enjoy", str(folder), "--output", str(output)]) == 0
     assert output.stat().st_size > 0
+
+
+def test_visibility_says_who_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "blindness.py").write_text(
+        "import numpy as np\ndef nobody(env, n=2):\n    return {agent: np.zeros(n, bool) for agent in env.possible_agents}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    flags = "--env mpe2.simple_spread_v3:parallel_env -n 160 --verbose 0 --eval-freq -1".split()
+    for name, settings in (("0.0", ["visibility:{blindness.nobody: {n: 2}}"]), ("1.0", [])):
+        words = "--allow-package mpe2 --allow-package blindness -params".split()
+        assert train_main(["-f", str(tmp_path), *flags, *words, *TINY["belief_ppo"], *settings]) == 0
+        folder = max((tmp_path / "belief_ppo").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        rows = read_csv(folder / "agents" / "agent_0" / "progress.csv")
+        assert rows[-1]["belief/visible_fraction"] == name
+
+
+def test_a_run_notes_the_versions_of_its_environment(tmp_path, monkeypatch):
+    monkeypatch.setattr(TrafficJunctionVecEnv, "versions", lambda self: {"map": "junction"}, raising=False)
+    assert train_tiny("ppo", tmp_path, "-n", "80") == 0
+    flags = ["--env", "mpe/simple_spread_v3", "-n", "80", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
+    assert train_main(["--algo", "ppo", *flags, "-params", *TINY["ppo"]]) == 0
+    told = {path.parent.name: json.loads(path.read_text())["environment"] for path in tmp_path.rglob("run.json")}
+    assert told == {f"{EASY}_1": {"map": "junction"}, "mpe-simple_spread_v3_1": {"mpe2": metadata.version("mpe2")}}
 
 
 def test_normalize_gives_each_agent_its_own_statistics(tmp_path):
