@@ -24,10 +24,10 @@ def attend(
 
 class _Attend(th.autograd.Function):
     """
-    Softmax attention with the usual gradient. Written out because the graph that PyTorch would record is half as fast: it
-    keeps and passes through several [B, T] matrices, of which the backward pass here needs one. Products with all rows are
-    dense matrix products (on a CPU these are faster than gathering [B, N, d]); sums over the kept rows are `embedding_bag`,
-    which touches no other. benchmarks/attention.py measures it against both alternatives.
+    Softmax attention with the usual gradient. Written out because the graph that PyTorch would record takes half as long
+    again: it keeps and passes through several [B, T] matrices, of which the backward pass here needs one. Products with all
+    rows are dense matrix products (on a CPU these are faster than gathering [B, N, d]); sums over the kept rows are
+    `embedding_bag`, which touches no other. benchmarks/attention.py measures it against both alternatives.
     """
 
     @staticmethod

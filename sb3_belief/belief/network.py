@@ -48,12 +48,13 @@ class HistoryContext(NamedTuple):
     """
     A history as the network sees it; constant as long as neither the history nor the weights change.
 
-    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``
+    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``;
+        None where the rows to attend to have been selected before
     :param keys: ``[T, d]``
     :param values: ``[T, d]``
     """
 
-    directions: th.Tensor
+    directions: th.Tensor | None
     keys: th.Tensor
     values: th.Tensor
 
@@ -131,9 +132,9 @@ class DynamicBelief(nn.Module):
         rows = history.filled()
         return self._encode(rows, self.observation_embedding(rows.observations))
 
-    def _encode(self, rows: History, embeddings: th.Tensor) -> HistoryContext:
+    def _encode(self, rows: History, embeddings: th.Tensor, to_compare: bool = True) -> HistoryContext:
         states = embeddings + self.action_embedding(rows.actions)
-        directions = self._direction(rows.observations, embeddings)
+        directions = self._direction(rows.observations, embeddings) if to_compare else None
         return HistoryContext(directions, self.key(states), self.value(states))
 
     def forward(
@@ -163,7 +164,7 @@ class DynamicBelief(nn.Module):
             embedding, embeddings = self.observation_embedding(th.cat([observations, rows.observations])).split(
                 [len(observations), len(rows.observations)]
             )
-            context = self._encode(rows, embeddings)
+            context = self._encode(rows, embeddings, to_compare=kept is None)
         else:
             embedding = self.observation_embedding(observations)
         if self.variant.attends:
@@ -196,6 +197,7 @@ class DynamicBelief(nn.Module):
         Eq. 3, with the sign that its text asks for: printed, the equation keeps the *least* similar rows. The choice
         is discrete, so no gradient flows through it.
         """
+        assert context.directions is not None
         similarity = self._direction(observations, embeddings) @ context.directions.T
         return similarity.topk(n_kept(self.keep_ratio, similarity.shape[1]), dim=1, sorted=False).indices
 

@@ -143,8 +143,10 @@ class BeliefAlgorithmMixin(_Algorithm):
     # -- rollout -------------------------------------------------------------------------------------------------------
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        # SB3 calls this once a step, right before it adds the step to the buffer: the place to stage the rest of the row
+        # SB3 calls this once a step, right before it bootstraps time limits and adds the step to the buffer
         super()._update_info_buffer(infos, dones)
+        if dones is not None and dones.any():
+            self.policy.terminal_values.compute(self.policy, infos, dones)
         active = np.ones(self.n_envs, dtype=bool)
         # SB3 takes environments that return fewer infos than copies
         active[: len(infos)] = [info.get("active", True) for info in infos]

@@ -20,6 +20,7 @@ from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flatten_observation
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
+from sb3_belief.belief_ppo.terminal_values import TerminalValues
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
@@ -104,6 +105,7 @@ class BeliefPolicyMixin(_Policy):
         self.action_coef = 0.5
         self.kl_coef = 0.005
         self._minibatch: BeliefMinibatch | None = None
+        self.terminal_values = TerminalValues()
         if features_extractor_class is None:
             features_extractor_class = self.default_extractor or fitting_extractor(observation_space)
         kwargs["features_extractor_class"] = features_extractor_class
@@ -247,6 +249,10 @@ class BeliefPolicyMixin(_Policy):
             return super()._predict(observation, deterministic, *args, **kwargs)
         with self._extractor.conditioned(sample=not deterministic):
             return super()._predict(observation, deterministic, *args, **kwargs)
+
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        value = self.terminal_values.take(obs)
+        return super().predict_values(obs) if value is None else value
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         minibatch, self._minibatch = self._minibatch, None
