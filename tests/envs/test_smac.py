@@ -18,7 +18,7 @@ from pettingzoo.test import parallel_api_test
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
 from sb3_belief.envs.adapters import smac, smacv2
 from tests.envs import fake_starcraft
-from tests.envs.tuple_families import train_save_load_evaluate
+from tests.envs.tuple_families import check_advantages, train_save_load_evaluate
 
 make: Any = smac.make
 make_v2: Any = smacv2.make
@@ -155,6 +155,37 @@ def test_the_step_limit_truncates(faults, maker):
     _, _, terminations, truncations, infos = env.step(still(env))
     assert not any(terminations.values()) and all(truncations.values()) and not env.agents
     assert {info["is_success"] for info in infos.values()} == {False}
+
+
+def battle_of_five_steps(is_won):
+    """Nobody meets; in the fifth step either the enemies fall or the limit is reached."""
+    env = make("3m")
+    reset, step, steps = env.reset, env.step, [0]
+
+    def begin(*args, **kwargs):
+        observations, infos = reset(*args, **kwargs)
+        hide(env)
+        env._masks = np.array(env.game.get_avail_actions(), dtype=bool)
+        for i, agent in enumerate(env.possible_agents):
+            infos[agent]["action_mask"] = env._masks[i]
+        near_the_limit(env, 10 if is_won else 5)
+        steps[0] = 0
+        return observations, infos
+
+    def go_on(actions):
+        steps[0] += 1
+        for enemy in env.game.enemies.values() if is_won and steps[0] == 5 else ():
+            enemy.health = 0.0
+        return step(actions)
+
+    env.reset, env.step = begin, go_on
+    return env
+
+
+@pytest.mark.parametrize("is_won", [True, False])
+def test_limits_are_bootstrapped_and_battles_that_are_over_are_not(faults, is_won):
+    ends = check_advantages(partial(battle_of_five_steps, is_won), lambda last: is_won, 16, MaskableBeliefPPO)
+    assert len(ends) == 3 * 2 * 3  # agents, copies, battles
 
 
 @pytest.mark.parametrize("maker", MAKERS)

@@ -43,14 +43,16 @@ def _weights(model: Any) -> th.Tensor:
     return th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
 
 
-def check_advantages(make_env: Callable[[], Any], terminates: Callable[[np.ndarray], bool], n_steps: int) -> list[bool]:
+def check_advantages(
+    make_env: Callable[[], Any], terminates: Callable[[np.ndarray], bool], n_steps: int, algorithm: Any = BeliefPPO
+) -> list[bool]:
     """
     Compare the advantages in all agents' rollout buffers with those computed here, from what the environment did.
 
     :param terminates: of an episode's last observation, whether the episode terminated and was not merely cut
     :return: for each end of an episode that was in the rollout, whether it was a termination
     """
-    team = make_team(make_env, n_steps, gamma=0.9, gae_lambda=0.8, n_epochs=1)
+    team = make_team(make_env, n_steps, algorithm, gamma=0.9, gae_lambda=0.8, n_epochs=1)
     watches = {agent: _Advantages(terminates) for agent in team.agents}
     team.learn(2 * n_steps, agent_callbacks=watches)
     assert all(watch.compared == 2 * n_steps for watch in watches.values())
