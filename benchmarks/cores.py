@@ -1,7 +1,5 @@
 """Two cores against one: the updates of Traffic Junction's ten agents with a belief, side by side or one after the other."""
 
-import inspect
-
 import torch as th
 
 from benchmarks.measure import cores, ratio
@@ -30,9 +28,6 @@ def run(report: Report) -> None:
     :param report: what is found goes there
     """
     report.title("cores", f"Traffic Junction as in b, belief_ppo, {cores()} cores")
-    if "jobs" not in inspect.signature(Team.__init__).parameters:
-        report.skip(_KEY, "not there: Team has no argument jobs")
-        return
     if cores() < 2:
         report.skip(_KEY, "there is one core only")
         return

@@ -22,7 +22,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from sb3_belief.belief_ppo.options import BELIEFS
-from sb3_belief.report.comparison import QUANTITIES, plot_comparison
+from sb3_belief.report.comparison import plot_comparison
+from sb3_belief.report.learning_curve import QUANTITIES
 from sb3_belief.team import Team
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.evaluate import evaluate
@@ -143,8 +144,7 @@ def main() -> None:
     results = compare(args.beliefs, args.seeds, args.jobs, **settings, episodes=args.episodes, log_folder=args.log_folder)
     if args.plot:
         runs = {belief: [r.folder for r in results if r.belief == belief] for belief in args.beliefs}
-        n_seeds = len(args.seeds)
-        title = f"{args.env}: mean of {n_seeds} seeds, and lowest to highest"
+        title = f"{args.env}: mean of {len(args.seeds)} seeds, and lowest to highest"
         print(plot_comparison(runs, args.plot, args.quantity, title=title))
 
 

@@ -6,10 +6,12 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import Loop, Sample, Spread, alternate, cores, speeds, spread
+from sb3_belief import versions as package
 
 #: What each ratio should be: at least (or at most, or less than) the number
 BARS: dict[str, tuple[str, float]] = {
@@ -25,7 +27,6 @@ BARS: dict[str, tuple[str, float]] = {
 }
 #: MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}
-_PACKAGES = ("sb3-belief", "stable-baselines3", "sb3-contrib", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2", "greenlet")
 _HOLDS = {">=": float.__ge__, "<=": float.__le__, "<": float.__lt__}
 
 
@@ -139,15 +140,12 @@ def versions() -> dict[str, Any]:
     """
     :return: what was measured with, and on
     """
-    found: dict[str, Any] = {"python": platform.python_version(), "system": platform.platform(), "cores": cores()}
+    found: dict[str, Any] = {**package.versions(), "system": platform.platform(), "cores": cores()}
     found["processor"] = _processor()
     # What else ran: on a busy machine only the ratios mean something
     found["load"] = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
-    for package in _PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = None
+    # Not where SMAX is measured
+    found["mpe2"] = metadata.version("mpe2") if find_spec("mpe2") else None
     return found
 
 

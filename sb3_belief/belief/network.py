@@ -130,9 +130,9 @@ class DynamicBelief(nn.Module):
         :return: Its filled rows as directions, keys and values
         """
         rows = history.filled()
-        return self._encode(rows, self.observation_embedding(rows.observations))
+        return self._encode_rows(rows, self.observation_embedding(rows.observations), to_compare=True)
 
-    def _encode(self, rows: History, embeddings: th.Tensor, to_compare: bool = True) -> HistoryContext:
+    def _encode_rows(self, rows: History, embeddings: th.Tensor, to_compare: bool) -> HistoryContext:
         states = embeddings + self.action_embedding(rows.actions)
         directions = self._direction(rows.observations, embeddings) if to_compare else None
         return HistoryContext(directions, self.key(states), self.value(states))
@@ -156,24 +156,23 @@ class DynamicBelief(nn.Module):
         :return: The belief and all that belongs to it
         :raises ValueError: if a variant that attends is given no history, or more rows are to be kept than it has
         """
-        if self.variant.attends and context is None:
-            if history is None:
-                raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
-            # In one pass with the observations: few large matrix products are faster than many small ones
-            rows = history.filled()
-            embedding, embeddings = self.observation_embedding(th.cat([observations, rows.observations])).split(
-                [len(observations), len(rows.observations)]
-            )
-            context = self._encode(rows, embeddings, to_compare=kept is None)
-        else:
-            embedding = self.observation_embedding(observations)
         if self.variant.attends:
-            assert context is not None
+            if context is not None:
+                embedding = self.observation_embedding(observations)
+            elif history is not None:
+                # In one pass with the observations: few large matrix products are faster than many small ones
+                rows = history.filled()
+                both = self.observation_embedding(th.cat([observations, rows.observations]))
+                embedding, embeddings = both.split([len(observations), len(rows.observations)])
+                context = self._encode_rows(rows, embeddings, to_compare=kept is None)
+            else:
+                raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
             if kept is None:
                 kept = self._most_similar(observations, embedding, context)
             summary, weights = self._attend(embedding, context, kept)
             embedding = embedding + summary
         else:
+            embedding = self.observation_embedding(observations)
             kept = th.zeros(len(observations), 0, dtype=th.long, device=observations.device)
             weights = embedding.new_zeros(kept.shape)
         encoded = self.encoder(embedding)

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_belief.report.learning_curve import INK, new_axes, read_monitor
+from sb3_belief.report.learning_curve import INK, QUANTITIES, new_axes, read_episodes, save
 
 COLOURS = ("#1f6f8b", "#c8553d", "#7a8b3c", "#6b5b95", "#b8860b", "#555555")
-QUANTITIES = {"return": "team return per episode", "success": "success rate"}
 
 
 def binned(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -52,14 +51,12 @@ def plot_comparison(
         raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
     curves = {}
     for name, folders in runs.items():
-        curves[name] = [read_monitor(folder) for folder in folders]
-        for folder, (steps, _, successes) in zip(folders, curves[name], strict=True):
-            if not len(steps):
-                raise ValueError(f"No episode ended in {os.fspath(folder)!r}: nothing to draw.")
+        curves[name] = [read_episodes(folder) for folder in folders]
+        for folder, (_, _, successes) in zip(folders, curves[name], strict=True):
             if quantity == "success" and np.isnan(successes).any():
                 raise ValueError(f"{os.fspath(folder)!r} tells no successes; draw quantity='return'.")
 
-    figure, axes = new_axes(title, QUANTITIES[quantity])
+    figure, axes = new_axes(title, quantity)
     edges = np.linspace(0, max(steps[-1] for runs_of in curves.values() for steps, _, _ in runs_of), n_bins + 1)
     middles = (edges[1:] + edges[:-1]) / 2
     for (name, runs_of), colour in zip(curves.items(), itertools.cycle(COLOURS), strict=False):
@@ -67,10 +64,5 @@ def plot_comparison(
         axes.plot(middles, rows.mean(axis=0), color=colour, lw=1.8, label=name)
         axes.fill_between(middles, rows.min(axis=0), rows.max(axis=0), color=colour, alpha=0.15, lw=0)
     axes.set_xlim(0, edges[-1])
-    if quantity == "success":
-        axes.set_ylim(-0.02, 1.02)
     axes.legend(frameon=False, loc="best", fontsize=9, labelcolor=INK)
-    path = Path(output)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path
+    return save(figure, output)

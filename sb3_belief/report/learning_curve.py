@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 INK, CURVE, GREEDY = "#333333", "#1f6f8b", "#c8553d"
+#: What a curve may show, and how its axis says so
+QUANTITIES = {"return": "team return per episode", "success": "success rate"}
 
 
 def read_monitor(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -59,10 +61,22 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[ends] - sums[starts]) / (ends - starts)
 
 
-def new_axes(title: str, unit: str) -> tuple[Any, Any]:
+def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    :param folder: a run's folder
+    :return: as ``read_monitor``
+    :raises ValueError: if the run has not finished an episode
+    """
+    steps, returns, successes = read_monitor(folder)
+    if not len(steps):
+        raise ValueError(f"No episode ended in {os.fspath(folder)!r}: nothing to draw.")
+    return steps, returns, successes
+
+
+def new_axes(title: str, quantity: str) -> tuple[Any, Any]:
     """
     :param title: what stands above
-    :param unit: what the y axis shows
+    :param quantity: what the y axis shows, a key of ``QUANTITIES``
     :return: matplotlib's figure and axes for curves over joint steps
     :raises ImportError: if matplotlib is not installed
     """
@@ -74,13 +88,27 @@ def new_axes(title: str, unit: str) -> tuple[Any, Any]:
     figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel("joint steps of the team")
-    axes.set_ylabel(unit)
+    axes.set_ylabel(QUANTITIES[quantity])
+    if quantity == "success":
+        axes.set_ylim(-0.02, 1.02)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value >= 1000 else f"{value:g}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", alpha=0.2)
     if title:
         axes.set_title(title, loc="left", fontsize=11, color=INK)
     return figure, axes
+
+
+def save(figure: Any, output: str | os.PathLike[str]) -> Path:
+    """
+    :param figure: matplotlib's
+    :param output: picture to write; folders that are missing are made
+    :return: its path
+    """
+    path = Path(output)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path
 
 
 def plot_learning_curve(
@@ -100,14 +128,12 @@ def plot_learning_curve(
     :raises ImportError: if matplotlib is not installed
     :raises ValueError: if the run has not finished an episode
     """
-    steps, returns, successes = read_monitor(folder)
-    if not len(steps):
-        raise ValueError(f"No episode ended in {os.fspath(folder)!r}: nothing to draw.")
+    steps, returns, successes = read_episodes(folder)
     tells_success = not np.isnan(successes).any()
     values = successes if tells_success else returns
     window = max(1, min(500, len(values) // 10))
 
-    figure, axes = new_axes(title, "success rate" if tells_success else "team return per episode")
+    figure, axes = new_axes(title, "success" if tells_success else "return")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
     evaluations = read_evaluations(folder)
     if evaluations is not None:
@@ -125,11 +151,6 @@ def plot_learning_curve(
             fontsize=9,
             color=INK,
         )
-    if tells_success:
-        axes.set_ylim(-0.02, 1.02)
     axes.set_xlim(0, steps[-1])
     axes.legend(frameon=False, loc="best", fontsize=9)
-    path = Path(output)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path
+    return save(figure, output)

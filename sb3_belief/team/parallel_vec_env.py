@@ -117,7 +117,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
         return self.venv.get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        self.venv.env_method("set_env_attr", attr_name, value, indices=indices)
+        self.env_method("set_env_attr", attr_name, value, indices=indices)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any

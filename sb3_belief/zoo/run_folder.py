@@ -10,8 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.vec_env import VecEnv
+
 from sb3_belief.envs.families import FAMILIES
-from sb3_belief.team import TeamVecEnv
 from sb3_belief.versions import versions
 from sb3_belief.zoo.errors import ConfigError
 
@@ -105,17 +106,17 @@ class RunRecord:
         beside.replace(self.path)
 
 
-def environment_versions(env_id: str, env: TeamVecEnv) -> dict[str, str]:
+def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
     """
     :param env_id: id of the environment
     :param env: the environment, after it has run: StarCraft II tells its version only then
     :return: {package: version} of the packages that it comes from, and what its own ``versions()`` says, if it has one
     """
     family = FAMILIES.get(env_id.partition("/")[0])
-    packages = metadata.packages_distributions()
-    found = {
-        name: metadata.version(name) for module in (family.modules if family else ()) for name in packages.get(module, ())
-    }
+    found: dict[str, str] = {}
+    if family is not None:
+        packages = metadata.packages_distributions()
+        found.update((name, metadata.version(name)) for module in family.modules for name in packages.get(module, ()))
     if env.has_attr("versions"):
         found.update(env.env_method("versions")[0])
     return found

@@ -128,7 +128,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         env.start_monitor(str(folder))
         if options.verbose:
             print(f"Run folder: {folder}  (seed {seed})")
-        return _learn(team, env, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
+        return _learn(team, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
 
 
 def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
@@ -226,14 +226,10 @@ def _callbacks(
 
 
 def _learn(
-    team: Team,
-    env: TeamVecEnv,
-    config: RunConfig,
-    options: TrainOptions,
-    folder: Path,
-    record: RunRecord,
-    callbacks: list[BaseCallback],
+    team: Team, config: RunConfig, options: TrainOptions, folder: Path, record: RunRecord, callbacks: list[BaseCallback]
 ) -> TrainResult:
+    env = team.get_env()
+    assert env is not None
     status = "failed"
     try:
         team.learn(
