@@ -2,8 +2,22 @@
 
 from typing import Any
 
+import numpy as np
 import torch as th
 import torch.nn.functional as F
+
+
+def largest(values: th.Tensor, n: int) -> th.Tensor:
+    """
+    :param values: ``[B, T]``, no gradient flows from them
+    :param n: How many are wanted, at most T
+    :return: Where the largest values of each row stand, in no particular order, long ``[B, n]``
+    """
+    if n == 0 or values.device.type != "cpu":
+        return values.topk(n, dim=1, sorted=False).indices
+    # A third of the time of topk()
+    columns = np.argpartition(values.detach().numpy(), -n, axis=1)[:, -n:]
+    return th.from_numpy(np.ascontiguousarray(columns))
 
 
 def attend(

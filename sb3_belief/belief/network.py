@@ -7,13 +7,14 @@ predicted (eq. 5 to 7).
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_belief.belief.attention import attend
+from sb3_belief.belief.attention import attend, largest
 from sb3_belief.belief.history import History
 from sb3_belief.belief.variants import VARIANTS
 
@@ -124,6 +125,14 @@ class DynamicBelief(nn.Module):
         beyond_embedding = (w + 1) * d + 3 * d**2 + (d + 1) * 2 * z + (z + 1) * w
         return max(1, round((beyond_embedding - z) / (d + 1 + z)))
 
+    def context_parameters(self) -> Iterator[th.Tensor]:
+        """
+        :return: All weights that the context of a history depends on
+        """
+        for layer in (*self.observation_embedding, self.action_embedding, self.key, self.value):
+            # Not parameters(), which looks for submodules: this is asked once a step
+            yield from (weight for weight in layer._parameters.values() if weight is not None)
+
     def encode_history(self, history: History) -> HistoryContext:
         """
         :param history: The agent's history
@@ -134,7 +143,7 @@ class DynamicBelief(nn.Module):
 
     def _encode_rows(self, rows: History, embeddings: th.Tensor, to_compare: bool) -> HistoryContext:
         states = embeddings + self.action_embedding(rows.actions)
-        directions = self._direction(rows.observations, embeddings) if to_compare else None
+        directions = F.normalize(self._compared(rows.observations, embeddings), dim=1) if to_compare else None
         return HistoryContext(directions, self.key(states), self.value(states))
 
     def forward(
@@ -178,7 +187,8 @@ class DynamicBelief(nn.Module):
         encoded = self.encoder(embedding)
         if self.variant.samples:
             mean, log_std = encoded.chunk(2, dim=1)
-            log_std = log_std.clamp(*LOG_STD_RANGE)
+            # clamp(), whose backward pass takes four times as long
+            log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
             latent = mean if noise is None else mean + log_std.exp() * noise
         else:
             latent = mean = encoded
@@ -186,9 +196,8 @@ class DynamicBelief(nn.Module):
         prediction = self.decoder(latent) if self.variant.predicts else None
         return BeliefOutput(latent, mean, log_std, prediction, kept, weights)
 
-    def _direction(self, observations: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
-        compared = embeddings if self.similarity == "embedding" else observations
-        return F.normalize(compared.detach(), dim=1)
+    def _compared(self, observations: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
+        return (embeddings if self.similarity == "embedding" else observations).detach()
 
     @th.no_grad()
     def _most_similar(self, observations: th.Tensor, embeddings: th.Tensor, context: HistoryContext) -> th.Tensor:
@@ -197,8 +206,9 @@ class DynamicBelief(nn.Module):
         is discrete, so no gradient flows through it.
         """
         assert context.directions is not None
-        similarity = self._direction(observations, embeddings) @ context.directions.T
-        return similarity.topk(n_kept(self.keep_ratio, similarity.shape[1]), dim=1, sorted=False).indices
+        # The length of the present one changes nothing in the order, so only the rows' directions are needed
+        similarity = self._compared(observations, embeddings) @ context.directions.T
+        return largest(similarity, n_kept(self.keep_ratio, similarity.shape[1]))
 
     def _attend(self, embedding: th.Tensor, context: HistoryContext, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch as th
@@ -37,6 +38,27 @@ class BeliefFeatures(NamedTuple):
     latent: th.Tensor
 
 
+@dataclass(slots=True)
+class Passing:
+    """
+    What changes from pass to pass. Not in the module itself, whose attributes take ten times as long to set.
+
+    :param given: Noise, history rows and whether to sample, see :meth:`BeliefExtractor.conditioned`
+    :param output: What the last pass believed, for whoever called it
+    :param noise: The noise it drew
+    :param acted_with: Noise and history rows of the last pass that chose actions, see :meth:`BeliefPolicyMixin.acted_with`
+    :param context: The encoded history
+    :param context_of: The state of weights and history that it was made from
+    """
+
+    given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
+    output: BeliefOutput | None = None
+    noise: th.Tensor | None = None
+    acted_with: tuple[th.Tensor, th.Tensor] | None = None
+    context: HistoryContext | None = None
+    context_of: list[tuple[int, int]] = field(default_factory=list)
+
+
 class BeliefExtractor(BaseFeaturesExtractor):
     """
     Features of the observation and, beside them, the belief about the others: :class:`BeliefFeatures`.
@@ -69,15 +91,11 @@ class BeliefExtractor(BaseFeaturesExtractor):
             history = empty_history(options.history_length, belief.observation_dim, belief.action_dim)
             for name, rows in history._asdict().items():
                 self.register_buffer(f"history_{name}", rows)
-        #: What the last pass believed, and the noise it drew; for whoever called it
-        self.output: BeliefOutput | None = None
-        self.noise: th.Tensor | None = None
-        self._given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
-        self._context: tuple[tuple[tuple[int, int], ...], HistoryContext] | None = None
+        self.passing = Passing()
 
     def __getstate__(self) -> dict[str, Any]:
         # What the last pass left behind is made again where it is needed
-        return {**vars(self), "output": None, "noise": None, "_context": None}
+        return {**vars(self), "passing": Passing()}
 
     @property
     def history(self) -> History | None:
@@ -106,19 +124,19 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :param kept: The history rows to attend to, ``[B, N_h]``
         :param sample: Whether to draw the noise
         """
-        self._given = (noise, kept, sample)
+        self.passing.given = (noise, kept, sample)
         try:
             yield
         finally:
-            self._given = (None, None, False)
+            self.passing.given = (None, None, False)
 
     def forward(self, observations: th.Tensor | TensorDict) -> BeliefFeatures:
-        noise, kept, sample = self._given
+        noise, kept, sample = self.passing.given
         flat = flatten_observation(observations)
         if sample and self.belief.variant.samples:
             noise = th.randn(len(flat), self.belief.latent_dim, device=flat.device)
-        self.output = output = self.infer(flat, noise, kept)
-        self.noise = noise
+        output = self.infer(flat, noise, kept)
+        self.passing.output, self.passing.noise = output, noise
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
         if self.options.detach_belief:
@@ -141,11 +159,13 @@ class BeliefExtractor(BaseFeaturesExtractor):
         Between two updates neither weights nor history change, so the encoded history is kept. Whether they did is told by
         PyTorch's version counters, which every optimiser step and every load moves: no caller has to think of it.
         """
-        tensors = [*self.belief.parameters(), *history]
-        state = tuple((tensor.data_ptr(), tensor._version) for tensor in tensors)
-        if self._context is None or self._context[0] != state:
-            self._context = state, self.belief.encode_history(history)
-        return self._context[1]
+        tensors = [*self.belief.context_parameters(), *history]
+        state = [(tensor.data_ptr(), tensor._version) for tensor in tensors]
+        context, passing = self.passing.context, self.passing
+        if context is None or passing.context_of != state:
+            context = passing.context = self.belief.encode_history(history)
+            passing.context_of = state
+        return context
 
 
 class BeliefFusion(nn.Module):

@@ -73,18 +73,24 @@ def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tup
     :return: The others' actions, float32 ``[n_envs, W]``, zero where not visible, and visibility, bool
         ``[n_envs, n_others]``. Zeroed here once more, so that a careless environment cannot leak what the agent did not see
     """
+    actions = _rows("others_actions", layout.width, infos).astype(np.float32, copy=False)
+    visible = _rows("others_visible", layout.n_others, infos).astype(bool, copy=False)
+    return np.where(visible.take(layout.owners, axis=1), actions, np.float32(0.0)), visible
+
+
+def _rows(key: str, width: int, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
     try:
-        actions = np.stack([info["others_actions"] for info in infos]).astype(np.float32, copy=False)
-        visible = np.stack([info["others_visible"] for info in infos]).astype(bool, copy=False)
-    except KeyError as missing:
+        rows = [np.asarray(info[key]) for info in infos]
+    except KeyError:
         raise ValueError(
-            f"the environment names others in 'others_action_spaces', but its info lacks {missing}; every step must bring "
+            f"the environment names others in 'others_action_spaces', but its info lacks {key!r}; every step must bring "
             "'others_actions' and 'others_visible' (a Team provides both)"
         ) from None
-    expected = (len(infos), layout.width), (len(infos), layout.n_others)
-    if (actions.shape, visible.shape) != expected:
+    wrong = {row.shape for row in rows} - {(width,)}
+    if wrong:
         raise ValueError(
-            f"info brings others_actions of shape {actions.shape[1:]} and others_visible of shape {visible.shape[1:]}; "
-            f"the others' action spaces ask for {expected[0][1:]} and {expected[1][1:]}"
+            f"info brings {key} of shape {sorted(wrong)[0]}; the others' action spaces ask for {(width,)}, see "
+            "sb3_belief.belief_ppo.others.action_layout (actions) and one truth value for each other (visible)"
         )
-    return np.where(visible[:, layout.owners], actions, np.float32(0.0)), visible
+    # A third of the time of stack()
+    return np.concatenate(rows).reshape(len(rows), width)

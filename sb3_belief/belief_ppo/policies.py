@@ -218,7 +218,9 @@ class BeliefPolicyMixin(_Policy):
         :return: Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`; of width 0 for a belief
             that does not sample, or does not attend
         """
-        return self._acted_with
+        acted_with = self._extractor.passing.acted_with
+        assert acted_with is not None
+        return acted_with
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
@@ -236,12 +238,11 @@ class BeliefPolicyMixin(_Policy):
         extractor = self._extractor
         with extractor.conditioned(sample=not deterministic):
             result = super().forward(obs, deterministic, *args, **kwargs)
-        assert extractor.output is not None
-        noise = extractor.noise
+        output, noise = extractor.passing.output, extractor.passing.noise
+        assert output is not None
         if noise is None:
-            mean = extractor.output.mean
-            noise = th.zeros_like(mean if extractor.belief.variant.samples else mean[:, :0])
-        self._acted_with = noise, extractor.output.kept
+            noise = th.zeros_like(output.mean if extractor.belief.variant.samples else output.mean[:, :0])
+        extractor.passing.acted_with = noise, output.kept
         return result
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False, *args: Any, **kwargs: Any) -> th.Tensor:
@@ -262,7 +263,7 @@ class BeliefPolicyMixin(_Policy):
         with extractor.conditioned(minibatch.noise, minibatch.kept):
             values, log_prob, entropy = super().evaluate_actions(obs, actions, *args, **kwargs)
         loss = self.belief_loss(minibatch)
-        extractor.output = None  # it holds the graph of this minibatch
+        extractor.passing.output = None  # it holds the graph of this minibatch
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 
     def belief_loss(self, minibatch: BeliefMinibatch) -> th.Tensor | None:
@@ -270,7 +271,7 @@ class BeliefPolicyMixin(_Policy):
         :param minibatch: The minibatch whose belief the extractor has inferred last
         :return: The terms of eq. 8 that train the belief, a scalar; None if there are none
         """
-        output, variant = self._extractor.output, self.options.variant
+        output, variant = self._extractor.passing.output, self.options.variant
         assert output is not None and variant is not None
         if output.prediction is None:
             return None

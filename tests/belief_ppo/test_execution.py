@@ -12,13 +12,13 @@ def test_deterministic_uses_the_mean_and_sampling_draws():
     obs = np.repeat(model.observation_space.sample()[None], 64, axis=0)
     tensor = th.as_tensor(obs)
     model.predict(obs, deterministic=True)
-    output = model.policy.features_extractor.output
+    output = model.policy.features_extractor.passing.output
     assert th.equal(output.latent, output.mean)
     model.predict(obs, deterministic=False)
-    output = model.policy.features_extractor.output
+    output = model.policy.features_extractor.passing.output
     assert (output.latent - output.mean).std(dim=0).min() > 0
     values = [model.policy.predict_values(tensor) for _ in range(2)]
-    assert th.equal(*values) and th.equal(model.policy.features_extractor.output.latent, output.mean)
+    assert th.equal(*values) and th.equal(model.policy.features_extractor.passing.output.latent, output.mean)
     # The cached history is the same as the one encoded afresh
     assert th.allclose(values[0], model.policy.predict_values(tensor.clone().requires_grad_()), atol=1e-6)
 
@@ -54,7 +54,7 @@ def test_what_policy_and_value_are_given(belief, policy_latent):
     values = []
     for _ in range(2):
         values.append(policy(tensor)[1])
-        output = policy.features_extractor.output
+        output = policy.features_extractor.passing.output
         assert th.equal(output.latent, output.mean) != samples  # the decoder's, whatever the policy is given
         if output.prediction is not None:
             th.testing.assert_close(output.prediction, policy.belief.decoder(output.latent))
