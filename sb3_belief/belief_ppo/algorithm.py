@@ -154,7 +154,8 @@ class BeliefAlgorithmMixin(_Algorithm):
             self.rollout_buffer.stage(active)
             return
         actions, visible = read_others(infos, self.policy.layout)
-        minibatch = BeliefMinibatch(*self.policy.acted_with(), th.as_tensor(actions), th.as_tensor(visible))
+        assert self.policy.acted_with is not None
+        minibatch = BeliefMinibatch(*self.policy.acted_with, th.as_tensor(actions), th.as_tensor(visible))
         self.rollout_buffer.stage(active, minibatch)
 
     # -- update --------------------------------------------------------------------------------------------------------

@@ -213,14 +213,17 @@ class BeliefPolicyMixin(_Policy):
         """
         self._minibatch = minibatch
 
-    def acted_with(self) -> tuple[th.Tensor, th.Tensor]:
+    @property
+    def acted_with(self) -> tuple[th.Tensor, th.Tensor] | None:
         """
-        :return: Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`; of width 0 for a belief
-            that does not sample, or does not attend
+        Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`; of width 0 for a belief that does
+        not sample, or does not attend; None without a belief. Can be set, for a call that was made in another process.
         """
-        acted_with = self._extractor.passing.acted_with
-        assert acted_with is not None
-        return acted_with
+        return self._extractor.passing.acted_with if self.has_belief else None
+
+    @acted_with.setter
+    def acted_with(self, noise_and_rows: tuple[th.Tensor, th.Tensor]) -> None:
+        self._extractor.passing.acted_with = noise_and_rows
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
@@ -242,7 +245,7 @@ class BeliefPolicyMixin(_Policy):
         assert output is not None
         if noise is None:
             noise = th.zeros_like(output.mean if extractor.belief.variant.samples else output.mean[:, :0])
-        extractor.passing.acted_with = noise, output.kept
+        self.acted_with = noise, output.kept
         return result
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False, *args: Any, **kwargs: Any) -> th.Tensor:

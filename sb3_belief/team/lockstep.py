@@ -23,7 +23,18 @@ from greenlet import GreenletExit, getcurrent, greenlet
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.team.agent_vec_env import AgentVecEnv
-from sb3_belief.team.members import ACTS, COUNTED, FINISHED, ROLLOUT_ENDED, UPDATES, UPDATES_HERE, Barrier, Member, Observer
+from sb3_belief.team.members import (
+    ACTS,
+    ACTS_ELSEWHERE,
+    COUNTED,
+    FINISHED,
+    ROLLOUT_ENDED,
+    UPDATES,
+    UPDATES_HERE,
+    Barrier,
+    Member,
+    Observer,
+)
 from sb3_belief.team.notes import add_note
 from sb3_belief.team.streams import RandomStream, StreamSwitch
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
@@ -143,6 +154,14 @@ class Lockstep:
         """
         return self._in_round and getcurrent() is self._members[agent].coroutine
 
+    def chooses_actions(self, agent: str) -> bool:
+        """
+        :param agent: whose policy is asked
+        :return: whether its own ``learn()`` asks, so that it can wait for others; where it has a callback that cannot be told
+        """
+        member = self._members.get(agent)
+        return member is not None and member.callback is None and getcurrent() is member.coroutine
+
     # For the team
 
     def reset(self) -> None:
@@ -192,6 +211,7 @@ class Lockstep:
         streams.to(stream)
         observer.on_rollout_start()
         while learning:
+            self._await_actions(streams)
             all_together = len(learning) == len(members)
             if not all_together:
                 for agent, member in members.items():
@@ -214,12 +234,19 @@ class Lockstep:
                 if member.state == COUNTED or not self._vote:
                     streams.to(member.stream)
                     self._resume(agent)
-                all_act = all_act and member.state == ACTS
+                all_act = all_act and member.state in (ACTS, ACTS_ELSEWHERE)
             if not all_act:
                 if any(member.state == ROLLOUT_ENDED for member in members.values()):
                     self._end_rollouts(ended, observer, stream, streams)
                 learning = self._learning()
         return self._go_on and all_together
+
+    def _await_actions(self, streams: StreamSwitch) -> None:
+        """All others have chosen their actions: those go on for whom this is done in other processes."""
+        for agent, member in self._members.items():
+            if member.state == ACTS_ELSEWHERE:
+                streams.to(member.stream)
+                self._resume(agent)
 
     def _learning(self) -> list[str]:
         return [agent for agent, member in self._members.items() if member.state != FINISHED]

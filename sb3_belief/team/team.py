@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_belief.team.acting import PolicyState
 from sb3_belief.team.building import check_env, check_names, per_agent
+from sb3_belief.team.jobs import Jobs, check_jobs
 from sb3_belief.team.lockstep import Lockstep
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.members import Member
@@ -29,7 +30,6 @@ from sb3_belief.team.progress import TeamProgress, as_callback
 from sb3_belief.team.roster import Roster, team_stream
 from sb3_belief.team.saving import read_team, spaces_manifest, write_team
 from sb3_belief.team.streams import StreamSwitch
-from sb3_belief.team.updates import Updates, check_jobs
 from sb3_belief.team.vec_env import TeamObs
 
 SelfTeam = TypeVar("SelfTeam", bound="Team")
@@ -57,8 +57,9 @@ class Team:
     :param log_dir: folder of CSV logs: ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None: none
     :param tensorboard_log: folder of TensorBoard logs: ``Team_<k>`` and ``Team_<k>/agents/<agent>``; None: none
     :param device: of all models
-    :param jobs: how many processes update the agents whose algorithms are on-policy (PPO, A2C, ...) at once, this one among
-        them; with any number the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can
+    :param jobs: how many processes share the agents whose algorithms are on-policy (PPO, A2C, ...), this one among them: each
+        updates its agents and, after their first update, chooses their actions (not with callbacks, gSDE or networks of one's
+        own); with any number the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can
         be imported (``if __name__ == "__main__":``); with ``torch.set_num_threads(1)`` each takes one core. ``train()`` of
         an algorithm of one's own may read and change all of its model but the environment
     :param agent_kwargs: {agent: {argument: value}} for single agents, overriding ``kwargs``
@@ -121,7 +122,7 @@ class Team:
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
         self._stream = team_stream(seed)
-        self._updates = Updates(roster.models, jobs)
+        self._jobs = Jobs(roster.models, jobs)
         self._learning = False
         # False when the agents' last observations are not all those of where the environment is now
         self._can_continue = False
@@ -220,7 +221,7 @@ class Team:
                     hub.reset()
                 total = total_timesteps + self.num_timesteps
                 progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": hub.env})
-            with self._updates.together(hub):
+            with self._jobs.shared_out(hub):
                 in_step = hub.run(members, progress, self._stream)
             with StreamSwitch(self._stream):
                 progress.on_training_end()

@@ -1,8 +1,8 @@
 """
 What an agent's update takes to a worker process and what it brings back.
 
-A job is the model as it is, without environment and logger, and where its random stream stands: nothing is kept in the workers
-from one update to the next. A result is what has become different. Tensors are written into those that are there, so that
+A job is the model as it is, without environment and logger, and where its random stream stands: no update builds on what a worker
+has kept of the one before. A result is what has become different. Tensors are written into those that are there, so that
 whoever holds a parameter, or counts its changes as PyTorch's version counters do, sees the update as if made here.
 """
 
@@ -18,11 +18,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from torch import nn
 
-from sb3_belief.team.update_messages import Message, dumps, loads
+from sb3_belief.team.jobs.messages import Message, dumps, loads
 
 #: Attributes of a model that stay where they are; a rollout buffer is used up by the update
 STAYS = ("env", "_vec_normalize_env", "_logger")
-#: Replaced in models while a team learns (see ``updates``)
+#: Replaced in models while a team learns (see ``sharing``)
 REPLACED = ("train", "_excluded_save_params")
 # For Python's rule that a warning is shown once per place
 _shown: dict[Any, Any] = {}

@@ -1,21 +1,28 @@
-"""Agents that are updated in several processes learn, draw and log the same as in one, bit for bit."""
+"""Agents that are updated, and act, in several processes learn, draw and log the same as in one, bit for bit."""
 
 import gc
 import json
 import multiprocessing
 import os
+import pickle
 import signal
 import warnings
+from collections import Counter
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.team.jobs.acting import Pass
+from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.zoo.cli import train_main
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import ToyEnv
@@ -144,6 +151,131 @@ def test_the_same_is_learned(case):
         assert one == results[1][key], key
 
 
+@pytest.fixture
+def passes(monkeypatch):
+    """
+    :return: {agent: how many of its policy's passes were sent to a worker}
+    """
+    counts: Counter[str] = Counter()
+    send = Workers.send
+
+    def count(self, number, agent, job):
+        counts[agent] += isinstance(job, Pass)
+        send(self, number, agent, job)
+
+    monkeypatch.setattr(Workers, "send", count)
+    return counts
+
+
+class Pushes(ToyEnv):
+    """With actions for which there is gSDE."""
+
+    def action_space(self, agent):
+        return spaces.Box(-1, 1, (1,), np.float32)
+
+    def step(self, actions):
+        return super().step({agent: 1 + np.sign(action[0]) for agent, action in actions.items()})
+
+
+class OwnNetwork(FlattenExtractor):
+    """Leaves something behind at each pass, which one that is made elsewhere would not."""
+
+    passes = 0
+
+    def forward(self, observations):
+        self.passes += 1
+        return super().forward(observations) * (1 + self.passes % 3)
+
+
+class Disturbs(BaseCallback):
+    """A team's callback that changes an agent within rollouts."""
+
+    model: Any
+
+    def _on_step(self):
+        with th.no_grad():
+            if self.n_calls % 7 == 0:
+                # Written to, and replaced
+                next(self.model.agents["agent_0"].policy.parameters()).mul_(1.01)
+                policy = self.model.agents["agent_0"].policy.action_net
+                policy.bias = th.nn.Parameter(policy.bias + 0.1)
+        return True
+
+
+# Of 5 rollouts of 8 steps, in two learn(): how many of the first agent's passes a worker makes, none of the first rollout
+ACTING: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
+    "elsewhere": ({}, {}, 32),
+    "with masks": ({"algo": MaskablePPO, "env_id": EASY}, {}, 32),
+    "with a belief": ({"algo": BeliefPPO, "policy": "BeliefPolicy", "env_id": EASY, "history_length": 30}, {}, 32),
+    "without callbacks only": ({}, {"agent_0": Draws}, 0),
+    "noise of a rollout": ({"policy_kwargs": {"log_std_init": -1.0}, "use_sde": True, "env_id": Pushes}, {}, 0),
+    "own networks": ({"policy_kwargs": {"features_extractor_class": OwnNetwork}}, {}, 0),
+    "recurrent": ({"algo": RecurrentPPO, "policy": "MlpLstmPolicy"}, {}, 0),
+    # Each rollout goes on elsewhere until a weight is changed
+    "disturbed": ({}, {"team": Disturbs}, 6 + 5 + 7 + 6),
+}
+
+
+@pytest.mark.parametrize("case", ACTING)
+def test_who_acts_elsewhere(case, passes):
+    team_kwargs, callbacks, expected = ACTING[case]
+    results = []
+    for jobs in (1, 2):
+        passes.clear()
+        team = toy_team(**{"algo": PPO, "jobs": jobs, "n_steps": 8, "batch_size": 8, "n_epochs": 1, **team_kwargs})
+        for n_rollouts in (3, 2):
+            own = {agent: callback() for agent, callback in callbacks.items()}
+            team_callback = own.pop("team", None)
+            team.learn(16 * n_rollouts, team_callback, agent_callbacks=own, reset_num_timesteps=False)
+        results.append(everything(team, {}))
+        in_worker, here = team.possible_agents[:2]
+        assert (passes[in_worker], passes[here]) == (expected if jobs == 2 else 0, 0)
+        assert all("forward" not in vars(model.policy) for model in team.agents.values())
+    assert results[0] == results[1]
+
+
+def test_a_copy_of_a_policy_acts_by_itself():
+    copies: list[Any] = []
+
+    class Copies(BaseCallback):
+        model: Any
+
+        def _on_step(self):
+            policy = self.model.agents["agent_0"].policy
+            copies[:] = [deepcopy(policy), pickle.loads(pickle.dumps(policy))]
+            return True
+
+    team = toy_team(PPO, 2, **PPO_SMALL)
+    team.learn(40, callback=Copies())
+    obs = th.as_tensor(team.get_env().reset()["agent_0"])
+    with th.no_grad():
+        before = [copy(obs, deterministic=True)[1] for copy in copies]
+        for parameter in team.agents["agent_0"].policy.parameters():
+            parameter.zero_()
+        after = [copy(obs, deterministic=True)[1] for copy in copies]
+    assert th.equal(before[0], before[1]) and th.equal(before[0], after[0]) and th.equal(before[1], after[1])
+    assert float(before[0].abs().max()) > 0
+
+
+class FailsLater(PPO):
+    """Its policy cannot act any more after the first update."""
+
+    policy: Any
+
+    def train(self):
+        super().train()
+        self.policy.action_dist = None
+
+
+def test_an_error_of_a_policy_in_a_worker_is_seen(passes):
+    for jobs in (1, 2):
+        team = toy_team({"agent_0": FailsLater, "agent_1": PPO}, jobs, **PPO_SMALL)
+        with pytest.raises(ValueError, match="Invalid action distribution") as caught:
+            team.learn(64)
+        assert "agent 'agent_0'" in notes(caught.value) and "joint step 8" in notes(caught.value)
+    assert passes["agent_0"] == 1
+
+
 class Odd(PPO):
     """Does in ``train()`` what algorithms of one's own may do."""
 
@@ -201,7 +333,7 @@ def test_an_algorithm_of_ones_own_may_change_anything_of_its_model():
 
 def no_processes_stay():
     gc.collect()
-    return not [process for process in multiprocessing.active_children() if process.name.startswith("update-worker")]
+    return not [process for process in multiprocessing.active_children() if process.name.startswith("team-worker")]
 
 
 def goes_on(team, tmp_path):
@@ -242,7 +374,7 @@ def test_an_error_in_a_worker(tmp_path):
 @pytest.mark.filterwarnings("ignore:odd", "ignore::RuntimeWarning")
 def test_a_worker_dies(tmp_path):
     team = toy_team(Odd, 2, env_id=lambda: ToyEnv(3), **PPO_SMALL, agent_kwargs={"agent_0": {"at": 2, "kill": True}})
-    with pytest.raises(RuntimeError, match=r"process 0 .* died while it had to update agent_0, agent_2"):
+    with pytest.raises(RuntimeError, match=r"process 0 .* died while it was busy with agent_0, agent_2"):
         team.learn(64)
     assert no_processes_stay()
     goes_on(team, tmp_path)
@@ -259,10 +391,11 @@ def test_ctrl_c_while_workers_update(tmp_path):
 
 
 def test_workers_wait_for_the_next_learn_and_end_with_the_team():
+    assert no_processes_stay()
     team = toy_team(PPO, 9, **PPO_SMALL).learn(16)
 
     def pids():
-        return [process.pid for process in multiprocessing.active_children() if process.name.startswith("update-worker")]
+        return [process.pid for process in multiprocessing.active_children() if process.name.startswith("team-worker")]
 
     first = pids()
     # Two agents: this process and one more

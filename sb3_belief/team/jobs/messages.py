@@ -4,15 +4,25 @@ import io
 import pickle
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle
 import numpy as np
 import torch as th
 from torch import nn
 
-#: A pickle, and the large arrays that it leaves out
-Message = tuple[bytes, list[Any]]
+
+class Message(NamedTuple):
+    """
+    :param head: a pickle
+    :param buffers: the large arrays that it leaves out
+    """
+
+    head: bytes
+    buffers: list[Any]
+
+
+# Bytes from which on an array is one
 _LARGE = 1 << 12
 # Finds what stands for itself in the message that is being read
 _find: Callable[[Any], Any] = id
@@ -60,7 +70,7 @@ def dumps(obj: Any, known: dict[int, Any]) -> Message:
     """
     file, buffers = io.BytesIO(), list[Any]()
     _Pickler(file, known, buffers).dump(obj)
-    return file.getvalue(), buffers
+    return Message(file.getvalue(), buffers)
 
 
 def loads(message: Message, find: Callable[[Any], Any] = id) -> Any:
@@ -72,7 +82,7 @@ def loads(message: Message, find: Callable[[Any], Any] = id) -> Any:
     global _find
     before, _find = _find, find
     try:
-        return pickle.loads(message[0], buffers=message[1])
+        return pickle.loads(message.head, buffers=message.buffers)
     finally:
         _find = before
 
@@ -81,35 +91,49 @@ def _recall(known: Any) -> Any:
     return _find(known)
 
 
-def send(connection: Connection, message: Message) -> None:
+def send(connection: Connection, agent: str, content: Any) -> None:
     """
     :param connection: to the other process
-    :param message: for it
+    :param agent: whom it is about
+    :param content: a ``Message``, or something small without tensors, whose pickle does not need one
     """
-    buffers = [buffer.raw() for buffer in message[1]]
-    connection.send(([buffer.nbytes for buffer in buffers], message[0]))
+    if not isinstance(content, Message):
+        connection.send((agent, None, content))
+        return
+    buffers = [buffer.raw() for buffer in content.buffers]
+    connection.send((agent, [buffer.nbytes for buffer in buffers], content.head))
     for buffer in buffers:
         connection.send_bytes(buffer)
 
 
-def receive(connection: Connection) -> Message:
+def receive(connection: Connection) -> tuple[str, Any]:
     """
     :param connection: to the other process
-    :return: what it has sent
+    :return: whom it is about, and what it has sent
     """
-    sizes, head = connection.recv()
+    agent, sizes, content = connection.recv()
+    if sizes is None:
+        return agent, content
     buffers = [bytearray(size) for size in sizes]
     for buffer in buffers:
         connection.recv_bytes_into(buffer)
-    return head, buffers
+    return agent, Message(content, buffers)
+
+
+def own_tensor(array: np.ndarray, stride: tuple[int, ...]) -> th.Tensor:
+    """
+    :param array: the values
+    :param stride: of the tensor that they were
+    :return: the same in memory and order of PyTorch's own: by where a tensor lies, matrix products may differ in the last bit
+    """
+    source = th.from_numpy(array)
+    return th.empty_strided(source.shape, stride, dtype=source.dtype).copy_(source)
 
 
 def _tensor(
     array: np.ndarray, stride: tuple[int, ...], is_parameter: bool, requires_grad: bool, grad: th.Tensor | None
 ) -> th.Tensor:
-    # In memory and order of PyTorch's own: by where a tensor lies, matrix products may differ in the last bit
-    source = th.from_numpy(array)
-    tensor = th.empty_strided(source.shape, stride, dtype=source.dtype).copy_(source)
+    tensor = own_tensor(array, stride)
     if is_parameter:
         tensor = nn.Parameter(tensor, requires_grad)
     else:

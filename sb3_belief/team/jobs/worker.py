@@ -1,4 +1,4 @@
-"""A worker process, which updates models: nothing of an update stays in it."""
+"""A worker process: it updates models as they are sent, and chooses actions with the policies that it has updated."""
 
 import io
 import queue
@@ -18,8 +18,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
-from sb3_belief.team.update_jobs import STAYS, modules_of, optimizers_of, read_stream, tensors_of, write_stream
-from sb3_belief.team.update_messages import Message, dumps, loads, receive, send
+from sb3_belief.team.jobs.acting import Pass, PassDone, do_pass
+from sb3_belief.team.jobs.messages import Message, dumps, loads, receive, send
+from sb3_belief.team.jobs.updating import STAYS, modules_of, optimizers_of, read_stream, tensors_of, write_stream
 
 # What PyTorch keeps in every module: parameters and submodules, which are looked at by themselves, and hooks
 _MODULE_KEYS = set(vars(nn.Module())) - {"training"}
@@ -35,15 +36,21 @@ def serve(connection: Connection) -> None:
     # The terminal sends Ctrl-C to the whole group; it is the team's
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The team sends without waiting for results, so both ways must always be free
-    jobs: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
-    results: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    jobs: queue.SimpleQueue[tuple[str, Message | Pass] | None] = queue.SimpleQueue()
+    results: queue.SimpleQueue[tuple[str, Message | PassDone | None]] = queue.SimpleQueue()
     threading.Thread(target=_receive_jobs, args=(connection, jobs), daemon=True).start()
     threading.Thread(target=_send_results, args=(connection, results), daemon=True).start()
-    while (job := jobs.get()) is not None:
-        results.put(update(job))
+    policies: dict[str, Any] = {}
+    while (given := jobs.get()) is not None:
+        agent, job = given
+        if isinstance(job, Pass):
+            results.put((agent, do_pass(policies.get(agent), job)))
+        else:
+            result, policies[agent] = update(job)
+            results.put((agent, result))
 
 
-def _receive_jobs(connection: Connection, jobs: "queue.SimpleQueue[Message | None]") -> None:
+def _receive_jobs(connection: Connection, jobs: queue.SimpleQueue) -> None:
     try:
         while True:
             jobs.put(receive(connection))
@@ -51,10 +58,10 @@ def _receive_jobs(connection: Connection, jobs: "queue.SimpleQueue[Message | Non
         jobs.put(None)
 
 
-def _send_results(connection: Connection, results: "queue.SimpleQueue[Message]") -> None:
+def _send_results(connection: Connection, results: queue.SimpleQueue) -> None:
     try:
         while True:
-            send(connection, results.get())
+            send(connection, *results.get())
     except OSError:
         # The team is gone, as the other thread notices
         pass
@@ -145,14 +152,15 @@ class _Before:
         }
 
 
-def update(job: Message) -> Message:
+def update(job: Message) -> tuple[Message, Any]:
     """
     :param job: as ``pack`` made it
-    :return: the result, for ``unpack_result``
+    :return: the result, for ``unpack_result``, and the updated policy
     """
     recorder, output = _Recorder(), io.StringIO()
     content: dict[str, Any] = {"tensors": None, "error": None}
     before: _Before | None = None
+    policy = None
     with warnings.catch_warnings(record=True) as caught, redirect_stdout(output):
         warnings.simplefilter("always")
         try:
@@ -164,14 +172,15 @@ def update(job: Message) -> Message:
         try:
             if before is not None:
                 content.update(before.changes(), stream=read_stream())
+                policy = model.policy
         except Exception as error:
             content.update(_failure(error), tensors=None)
     content.update(output=output.getvalue(), log=recorder.calls)
     content["warnings"] = [(str(w.message), w.category, w.filename, w.lineno) for w in caught]
     try:
-        return dumps(content, {})
+        return dumps(content, {}), policy
     except Exception as error:
-        return dumps({**content, **_failure(error), "tensors": None, "log": []}, {})
+        return dumps({**content, **_failure(error), "tensors": None, "log": []}, {}), None
 
 
 def _rebuild(job: Message, recorder: _Recorder) -> BaseAlgorithm:

@@ -1,0 +1,115 @@
+"""The worker processes of a team: started when they are needed, ended with it."""
+
+import multiprocessing
+import os
+import weakref
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+from sb3_belief.team.jobs.messages import receive, send
+from sb3_belief.team.jobs.worker import serve
+
+
+class _Worker(NamedTuple):
+    """
+    :param process: itself
+    :param connection: to it
+    :param waiting: agents whose jobs it has been given, in order
+    :param arrived: {agent: result that has been read before it was asked for}
+    """
+
+    process: Any
+    connection: Connection
+    waiting: list[str]
+    arrived: dict[str, Any]
+
+
+class Workers:
+    """Processes that update agents and choose their actions, ended with the last reference to this."""
+
+    def __init__(self) -> None:
+        self._all: list[_Worker] = []
+        weakref.finalize(self, _end, self._all, os.getpid())
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def start(self, n: int) -> bool:
+        """
+        :param n: how many there are to be
+        :return: whether any was started
+        """
+        if any(not worker.process.is_alive() for worker in self._all):
+            self.end()
+        methods = multiprocessing.get_all_start_methods()
+        # A process that has trained must not be forked: autograd has threads
+        context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        missing = range(len(self._all), n)
+        for i in missing:
+            here, there = context.Pipe()
+            process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
+            process.start()
+            there.close()
+            self._all.append(_Worker(process, here, [], {}))
+        return len(missing) > 0
+
+    def send(self, number: int, agent: str, job: Any) -> None:
+        """
+        :param number: of the worker
+        :param agent: whose job it is; it has no other one at the time
+        :param job: to do after those it has
+        :raises RuntimeError: if the worker is dead
+        """
+        worker = self._all[number]
+        worker.waiting.append(agent)
+        try:
+            send(worker.connection, agent, job)
+        except OSError as error:
+            raise self._death(number) from error
+
+    def receive(self, number: int, agent: str) -> Any:
+        """
+        :param number: of the worker
+        :param agent: whose job it was given
+        :return: the result
+        :raises RuntimeError: if the worker died over it
+        """
+        worker = self._all[number]
+        while agent not in worker.arrived:
+            try:
+                # Not every death of a process closes its connection
+                while not worker.connection.poll(1.0):
+                    if not worker.process.is_alive() and not worker.connection.poll(0):
+                        raise EOFError
+                whose, result = receive(worker.connection)
+            except (EOFError, OSError) as error:
+                raise self._death(number) from error
+            worker.waiting.remove(whose)
+            worker.arrived[whose] = result
+        return worker.arrived.pop(agent)
+
+    def _death(self, number: int) -> RuntimeError:
+        worker = self._all[number]
+        # It may need a moment to end
+        worker.process.join(1.0)
+        return RuntimeError(
+            f"Worker process {number} (exit code {worker.process.exitcode}) died while it was busy with"
+            f" {', '.join(worker.waiting)}; see its own error above, if it could write one. The next learn() starts new ones;"
+            " with jobs=1 there are none. A script that uses them needs the line 'if __name__ == \"__main__\":' before what it"
+            " does."
+        )
+
+    def end(self) -> None:
+        """End them all, whatever they do."""
+        _end(self._all, os.getpid())
+
+
+def _end(workers: list[_Worker], pid: int) -> None:
+    # Not by a forked child, which has a copy of the list
+    if os.getpid() == pid:
+        for worker in workers:
+            worker.connection.close()
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join(5.0)
+    workers.clear()
