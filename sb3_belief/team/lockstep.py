@@ -26,6 +26,7 @@ from sb3_belief.team.agent_vec_env import AgentVecEnv
 from sb3_belief.team.members import (
     ACTS,
     ACTS_ELSEWHERE,
+    ACTS_HERE,
     COUNTED,
     FINISHED,
     ROLLOUT_ENDED,
@@ -234,7 +235,7 @@ class Lockstep:
                 if member.state == COUNTED or not self._vote:
                     streams.to(member.stream)
                     self._resume(agent)
-                all_act = all_act and member.state in (ACTS, ACTS_ELSEWHERE)
+                all_act = all_act and member.state in (ACTS, ACTS_HERE, ACTS_ELSEWHERE)
             if not all_act:
                 if any(member.state == ROLLOUT_ENDED for member in members.values()):
                     self._end_rollouts(ended, observer, stream, streams)
@@ -242,11 +243,12 @@ class Lockstep:
         return self._go_on and all_together
 
     def _await_actions(self, streams: StreamSwitch) -> None:
-        """All others have chosen their actions: those go on for whom this is done in other processes."""
-        for agent, member in self._members.items():
-            if member.state == ACTS_ELSEWHERE:
-                streams.to(member.stream)
-                self._resume(agent)
+        """With several processes: first those act who do so in this one, while the others are busy."""
+        for state in (ACTS_HERE, ACTS_ELSEWHERE):
+            for agent, member in self._members.items():
+                if member.state == state:
+                    streams.to(member.stream)
+                    self._resume(agent)
 
     def _learning(self) -> list[str]:
         return [agent for agent, member in self._members.items() if member.state != FINISHED]

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
 # With updates in several processes: it is to be updated in this one, or waits for the others to be
 UPDATES_HERE, UPDATES = "updates here", "updates"
-# Its action is being chosen in another process
-ACTS_ELSEWHERE = "acts elsewhere"
+# The same for its next action
+ACTS_HERE, ACTS_ELSEWHERE = "acts here", "acts elsewhere"
 
 
 @dataclass

@@ -21,7 +21,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.team.jobs.acting import Pass
 from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.zoo.cli import train_main
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
@@ -157,13 +156,13 @@ def passes(monkeypatch):
     :return: {agent: how many of its policy's passes were sent to a worker}
     """
     counts: Counter[str] = Counter()
-    send = Workers.send
+    post = Workers.post
 
     def count(self, number, agent, job):
-        counts[agent] += isinstance(job, Pass)
-        send(self, number, agent, job)
+        counts[agent] += 1
+        post(self, number, agent, job)
 
-    monkeypatch.setattr(Workers, "send", count)
+    monkeypatch.setattr(Workers, "post", count)
     return counts
 
 

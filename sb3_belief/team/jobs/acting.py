@@ -15,7 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
 from sb3_belief.team.jobs.messages import own_tensor
-from sb3_belief.team.members import ACTS_ELSEWHERE
+from sb3_belief.team.members import ACTS_ELSEWHERE, ACTS_HERE
 
 if TYPE_CHECKING:
     from sb3_belief.team.jobs.workers import Workers
@@ -103,8 +103,9 @@ class ActsElsewhere:
             job = Pass(_sent(args), _sent(kwargs), th.get_rng_state().numpy())
         except TypeError:
             return _own_forward(self.policy)(*args, **kwargs)
-        self._workers.send(self.worker, self._agent, job)
+        self._workers.post(self.worker, self._agent, job)
         self.hub.wait(self._agent, ACTS_ELSEWHERE)
+        self._workers.flush()
         done: PassDone | None = self._workers.receive(self.worker, self._agent)
         if done is None:
             # It has failed: let it fail here, where its error is seen
@@ -113,6 +114,29 @@ class ActsElsewhere:
         if done.acted_with is not None:
             self.policy.acted_with = _received(done.acted_with)
         return _received(done.outputs)
+
+
+class ActsHere:
+    """
+    The same for a policy that acts in this process: when the passes of others have been sent, all at once.
+
+    :param hub: in which its agent learns
+    :param agent: whose policy it is
+    :param policy: the policy
+    :param workers: the processes
+    """
+
+    def __init__(self, hub: "Lockstep", agent: str, policy: nn.Module, workers: "Workers"):
+        self._hub, self._agent, self._policy, self._workers = hub, agent, policy, workers
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return _own_forward, (self._policy,)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if self._hub.chooses_actions(self._agent):
+            self._hub.wait(self._agent, ACTS_HERE)
+            self._workers.flush()
+        return _own_forward(self._policy)(*args, **kwargs)
 
 
 def _own_forward(policy: nn.Module) -> Any:
@@ -126,7 +150,8 @@ def do_pass(policy: Any, job: Pass) -> PassDone | None:
     :return: what has come of it; None if it failed
     """
     try:
-        policy.set_training_mode(False)
+        if policy.training:
+            policy.set_training_mode(False)
         th.set_rng_state(th.from_numpy(job.generator))
         with th.no_grad():
             outputs = policy(*_received(job.args), **_received(job.kwargs))

@@ -91,10 +91,10 @@ def _recall(known: Any) -> Any:
     return _find(known)
 
 
-def send(connection: Connection, agent: str, content: Any) -> None:
+def send(connection: Connection, agent: str | None, content: Any) -> None:
     """
     :param connection: to the other process
-    :param agent: whom it is about
+    :param agent: whom it is about; None for several
     :param content: a ``Message``, or something small without tensors, whose pickle does not need one
     """
     if not isinstance(content, Message):
@@ -106,10 +106,10 @@ def send(connection: Connection, agent: str, content: Any) -> None:
         connection.send_bytes(buffer)
 
 
-def receive(connection: Connection) -> tuple[str, Any]:
+def receive(connection: Connection) -> tuple[str | None, Any]:
     """
     :param connection: to the other process
-    :return: whom it is about, and what it has sent
+    :return: as they were sent: whom it is about, and what
     """
     agent, sizes, content = connection.recv()
     if sizes is None:

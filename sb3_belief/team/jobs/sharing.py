@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_belief.team.jobs.acting import ActsElsewhere, can_act_elsewhere
+from sb3_belief.team.jobs.acting import ActsElsewhere, ActsHere, can_act_elsewhere
 from sb3_belief.team.jobs.messages import Message
 from sb3_belief.team.jobs.updating import REPLACED, pack, read_stream, unpack_result, write_stream
 from sb3_belief.team.jobs.workers import Workers
@@ -103,6 +103,8 @@ class Jobs:
         model._excluded_save_params = partial(list, excluded)  # type: ignore[method-assign]
         if worker is None:
             model.train = partial(_train_here, hub, agent, model)  # type: ignore[method-assign]
+            if "forward" not in vars(model.policy):
+                model.policy.forward = ActsHere(hub, agent, model.policy, self._workers)  # type: ignore[method-assign]
             return
         model.train = partial(self._train, hub, agent, model, worker)  # type: ignore[method-assign]
         if can_act_elsewhere(model):

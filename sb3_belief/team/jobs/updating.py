@@ -1,9 +1,9 @@
 """
 What an agent's update takes to a worker process and what it brings back.
 
-A job is the model as it is, without environment and logger, and where its random stream stands: no update builds on what a worker
-has kept of the one before. A result is what has become different. Tensors are written into those that are there, so that
-whoever holds a parameter, or counts its changes as PyTorch's version counters do, sees the update as if made here.
+A job is the model as it is, without environment and logger, and where its random stream stands: no update builds on what a
+worker has kept of the one before. A result is what has become different. Tensors are written into those that are there, so
+that whoever holds a parameter, or counts its changes as PyTorch's version counters do, sees the update as if made here.
 """
 
 import random

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
-from sb3_belief.team.jobs.acting import Pass, PassDone, do_pass
+from sb3_belief.team.jobs.acting import do_pass
 from sb3_belief.team.jobs.messages import Message, dumps, loads, receive, send
 from sb3_belief.team.jobs.updating import STAYS, modules_of, optimizers_of, read_stream, tensors_of, write_stream
 
@@ -36,15 +36,15 @@ def serve(connection: Connection) -> None:
     # The terminal sends Ctrl-C to the whole group; it is the team's
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The team sends without waiting for results, so both ways must always be free
-    jobs: queue.SimpleQueue[tuple[str, Message | Pass] | None] = queue.SimpleQueue()
-    results: queue.SimpleQueue[tuple[str, Message | PassDone | None]] = queue.SimpleQueue()
+    jobs: queue.SimpleQueue[tuple[Any, Any] | None] = queue.SimpleQueue()
+    results: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()
     threading.Thread(target=_receive_jobs, args=(connection, jobs), daemon=True).start()
     threading.Thread(target=_send_results, args=(connection, results), daemon=True).start()
     policies: dict[str, Any] = {}
     while (given := jobs.get()) is not None:
         agent, job = given
-        if isinstance(job, Pass):
-            results.put((agent, do_pass(policies.get(agent), job)))
+        if agent is None:
+            results.put((None, {name: do_pass(policies.get(name), single) for name, single in job.items()}))
         else:
             result, policies[agent] = update(job)
             results.put((agent, result))

@@ -16,12 +16,14 @@ class _Worker(NamedTuple):
     :param connection: to it
     :param waiting: agents whose jobs it has been given, in order
     :param arrived: {agent: result that has been read before it was asked for}
+    :param posted: {agent: small job that is to be sent with others}
     """
 
     process: Any
     connection: Connection
     waiting: list[str]
     arrived: dict[str, Any]
+    posted: dict[str, Any]
 
 
 class Workers:
@@ -50,7 +52,7 @@ class Workers:
             process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
             process.start()
             there.close()
-            self._all.append(_Worker(process, here, [], {}))
+            self._all.append(_Worker(process, here, [], {}, {}))
         return len(missing) > 0
 
     def send(self, number: int, agent: str, job: Any) -> None:
@@ -66,6 +68,32 @@ class Workers:
             send(worker.connection, agent, job)
         except OSError as error:
             raise self._death(number) from error
+
+    def post(self, number: int, agent: str, job: Any) -> None:
+        """
+        As ``send``, with the next ``flush``: each message wakes a process, which costs as much as a small job.
+
+        :param number: of the worker
+        :param agent: whose job it is; it has no other one at the time
+        :param job: to do, small and without tensors
+        """
+        self._all[number].posted[agent] = job
+
+    def flush(self) -> None:
+        """
+        Send what was posted.
+
+        :raises RuntimeError: if a worker is dead
+        """
+        for number, worker in enumerate(self._all):
+            if worker.posted:
+                worker.waiting.extend(worker.posted)
+                jobs = dict(worker.posted)
+                worker.posted.clear()
+                try:
+                    send(worker.connection, None, jobs)
+                except OSError as error:
+                    raise self._death(number) from error
 
     def receive(self, number: int, agent: str) -> Any:
         """
@@ -84,8 +112,10 @@ class Workers:
                 whose, result = receive(worker.connection)
             except (EOFError, OSError) as error:
                 raise self._death(number) from error
-            worker.waiting.remove(whose)
-            worker.arrived[whose] = result
+            results = result if whose is None else {whose: result}
+            for name in results:
+                worker.waiting.remove(name)
+            worker.arrived.update(results)
         return worker.arrived.pop(agent)
 
     def _death(self, number: int) -> RuntimeError:
