@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_belief.team.checks import StepChecks
-from sb3_belief.team.joint_env import JointEnv, StepRecord, mask_width
+from sb3_belief.team.joint_env import JointEnv, mask_width
+from sb3_belief.team.parallel_worker import WorkersVecEnv, step_and_reset
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv, check_spaces
 
 
@@ -29,11 +30,10 @@ class ParallelTeamVecEnv(TeamVecEnv):
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], JointEnv]], subproc: bool = False):
-        self.venv: DummyVecEnv | SubprocVecEnv
-        self._interrupted = False
+        self.venv: _InProcessVecEnv | WorkersVecEnv
         self._masks: np.ndarray | None = None
         if subproc:
-            self.venv = SubprocVecEnv([_without_interrupts(env_fn) for env_fn in env_fns])
+            self.venv = WorkersVecEnv(list(env_fns))
         else:
             envs = [env_fn() for env_fn in env_fns]
             if len({id(env.env) for env in envs}) < len(envs):
@@ -53,6 +53,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
         except BaseException:
             self.venv.close()
             raise
+        if isinstance(self.venv, WorkersVecEnv):
+            self.venv.set_members(self._observation_spaces, self._action_spaces, self.scripted_action_spaces)
         self._discrete = [isinstance(self._action_spaces[agent], spaces.Discrete) for agent in agents]
         self._mask_widths = [mask_width(self._action_spaces[agent]) for agent in agents]
         self._checks = StepChecks(agents, self._observation_spaces, self._action_spaces, self._mask_widths)
@@ -146,77 +148,49 @@ class ParallelTeamVecEnv(TeamVecEnv):
             for agent, discrete in zip(self.possible_agents, self._discrete, strict=True)
         ]
         joint_actions = [dict(zip(self.possible_agents, row)) for row in zip(*columns)]  # noqa: B905 (lengths are checked)
-        if isinstance(self.venv, SubprocVecEnv):
+        if isinstance(self.venv, WorkersVecEnv):
             with self._worker_deaths("step"):
-                obs, rewards, dones, venv_infos = self._step_workers(self.venv, joint_actions)
-            obs = {agent: obs[agent].astype(space.dtype, copy=False) for agent, space in self._observation_spaces.items()}
+                obs, rewards, dones, infos = self._step_workers(self.venv, joint_actions)
         else:
-            obs, rewards, dones, venv_infos = self.venv.step(joint_actions)  # type: ignore[arg-type]
-        records: list[StepRecord] = [venv_info["joint"] for venv_info in venv_infos]
-        agent_rewards = np.array([record.agent_rewards for record in records], dtype=np.float32)
-        self._checks.numbers(obs, agent_rewards, self._lengths)
-        infos = []
-        for venv_info, record, own_rewards in zip(venv_infos, records, agent_rewards, strict=True):
-            active, life_end, truncated = record.flags
-            info = {
-                "agent_rewards": own_rewards,
-                "visible": record.visible,
-                "active": active,
-                "life_end": life_end,
-                "truncated": truncated,
-            }
-            if record.scripted_actions is not None:
-                info["scripted_actions"] = record.scripted_actions
-            if len(venv_info) > 1:
-                info.update(venv_info)
-                del info["joint"]
-            infos.append(info)
-        if records[0].action_masks is not None:
-            # At an episode's end the current masks are those of the new episode
-            self._masks = np.array(
-                [
-                    self.venv.reset_infos[i]["action_masks"] if done else record.action_masks
-                    for i, (record, done) in enumerate(zip(records, dones, strict=True))
-                ]
-            )
+            obs, rewards, dones, infos = self.venv.step(joint_actions)  # type: ignore[arg-type]
+        self._checks.numbers(obs, self.venv.agent_rewards, self._lengths)
+        if self.venv.action_masks is not None:
+            self._masks = self.venv.action_masks
             self._checks.masks(self._masks, np.where(dones, 0, self._lengths + 1))
-        return obs, np.asarray(rewards, dtype=np.float32), dones, infos
+        return obs, rewards, dones, infos
 
     # Workers
 
-    def _step_workers(self, venv: SubprocVecEnv, joint_actions: list[dict[str, Any]]) -> Any:
+    def _step_workers(self, venv: WorkersVecEnv, joint_actions: list[dict[str, Any]]) -> Any:
         # Nothing is sent or received by halves, the waiting between can be interrupted
         with _uninterrupted():
-            venv.step_async(joint_actions)  # type: ignore[arg-type]
-            self._interrupted = True
+            venv.step_async(joint_actions)
         self._await_workers(venv)
         with _uninterrupted():
-            result = venv.step_wait()
-            self._interrupted = False
-        return result
+            return venv.step_wait()
 
     @staticmethod
-    def _await_workers(venv: SubprocVecEnv) -> None:
+    def _await_workers(venv: WorkersVecEnv) -> None:
         # Whether the death of a worker closes its pipe depends on the start method (forked siblings hold copies of it),
-        # so a plain recv() could wait for ever
-        for remote, process in zip(venv.remotes, venv.processes, strict=True):
+        # so a plain recv() could wait for ever. The last to start is likely the last to finish: to wait for it first is to
+        # be woken once.
+        for remote, process in reversed(list(zip(venv.remotes, venv.processes, strict=True))):
             while not remote.poll(1.0):
                 if not process.is_alive() and not remote.poll(0):
                     raise EOFError
 
     def _finish_interrupted_step(self) -> None:
-        if self._interrupted and isinstance(self.venv, SubprocVecEnv) and not self.venv.closed:
+        if isinstance(self.venv, WorkersVecEnv) and self.venv.waiting:
             with self._worker_deaths("step"):
                 self._await_workers(self.venv)
                 self.venv.step_wait()
-            self._interrupted = False
 
     @contextmanager
     def _worker_deaths(self, doing: str) -> Iterator[None]:
         try:
             yield
         except (EOFError, OSError) as error:
-            if not isinstance(self.venv, SubprocVecEnv):
+            if not isinstance(self.venv, WorkersVecEnv):
                 raise
             if self.venv.closed:
                 raise RuntimeError(f"Cannot {doing}: the environment is closed, its worker processes have ended.") from error
@@ -230,14 +204,13 @@ class ParallelTeamVecEnv(TeamVecEnv):
                 " if it could write one. The other workers have been ended: make a new environment to go on."
             ) from error
 
-    def _end_workers(self, venv: SubprocVecEnv) -> None:
+    def _end_workers(self, venv: WorkersVecEnv) -> None:
         for process in venv.processes:
             process.terminate()
         for process, remote in zip(venv.processes, venv.remotes, strict=True):
             process.join(5.0)
             remote.close()
         venv.waiting, venv.closed = False, True
-        self._interrupted = False
 
 
 class _InProcessVecEnv(DummyVecEnv):
@@ -250,50 +223,45 @@ class _InProcessVecEnv(DummyVecEnv):
 
     # Agent, shape and type of its stacked observations
     layout: list[tuple[str, tuple[int, ...], Any]]
+    # As in WorkersVecEnv
+    agent_rewards: np.ndarray
+    action_masks: np.ndarray | None = None
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :return: observations {agent: array [num_envs, ...]}, rewards float32 [num_envs], dones bool [num_envs], infos
+        :return: observations {agent: array [num_envs, ...]}, rewards float32 [num_envs], dones bool [num_envs] and infos as
+            a ``TeamVecEnv`` has them
         """
-        observations: list[dict[str, np.ndarray]] = []
-        rewards: list[float] = []
-        dones: list[bool] = []
-        infos: list[dict[str, Any]] = []
-        for env_idx, env in enumerate(self.envs):
-            obs, reward, terminated, truncated, info = env.step(self.actions[env_idx])
-            if terminated or truncated:
-                info["TimeLimit.truncated"] = truncated and not terminated
-                # The environment may use its arrays again
-                info["terminal_observation"] = {agent: np.array(part) for agent, part in obs.items()}
-                obs, self.reset_infos[env_idx] = env.reset()
-            observations.append(obs)
-            rewards.append(reward)  # type: ignore[arg-type]
-            dones.append(terminated or truncated)
-            infos.append(info)
+        steps = [step_and_reset(env, action) for env, action in zip(self.envs, self.actions, strict=True)]  # type: ignore[arg-type]
+        observations, rewards, dones, records, masks, others = zip(*steps, strict=True)
         # concatenate() takes a third of the time of array()
         stack = partial(np.concatenate, axis=None, casting="unsafe")
         stacked = {
             agent: stack([obs[agent] for obs in observations], dtype=dtype).reshape(shape)
             for agent, shape, dtype in self.layout
         }
+        self.agent_rewards = np.array([record.agent_rewards for record in records], dtype=np.float32)
+        infos = []
+        for record, own_rewards, other in zip(records, self.agent_rewards, others, strict=True):
+            active, life_end, truncated = record.flags
+            info = {
+                "agent_rewards": own_rewards,
+                "visible": record.visible,
+                "active": active,
+                "life_end": life_end,
+                "truncated": truncated,
+            }
+            if record.scripted_actions is not None:
+                info["scripted_actions"] = record.scripted_actions
+            if other:
+                info.update(other)
+            infos.append(info)
+        self.action_masks = None if masks[0] is None else np.array(masks)
         return stacked, np.array(rewards, dtype=np.float32), np.array(dones), infos
 
 
 def _same(env: JointEnv) -> JointEnv:
     return env
-
-
-def _without_interrupts(env_fn: Callable[[], JointEnv]) -> Callable[[], JointEnv]:
-    """
-    :return: ``env_fn`` for a worker process, which then leaves Ctrl-C to the main process
-    """
-
-    def make() -> JointEnv:
-        # The terminal sends Ctrl-C to the whole group; SB3's workers would end and the environment with them
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return env_fn()
-
-    return make
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief.team import JointEnv
 from tests.team.helpers import make_team_env
-from tests.team.toy_envs import FaultyEnv, MaskedEnv, MixedEnv, ScriptedEnv, ToyEnv
+from tests.team.toy_envs import FaultyEnv, MaskedEnv, MixedEnv, PartneredEnv, ScriptedEnv, ToyEnv
 
 ZEROS = {agent: np.zeros(1, int) for agent in ("stays", "dies", "cut", "last")}
 
@@ -92,6 +92,57 @@ def test_workers_equal_in_process():
     # copy i has the seed 5 + i
     env = make_team_env(simple_spread_v3.parallel_env, n_envs=1, seed=6)
     assert np.array_equal(env.reset()["agent_1"][0], runs[0][0][0]["agent_1"][1])
+
+
+class Sensitive(MixedEnv):
+    """Rewards the exact number, type and kind of the action."""
+
+    def step(self, actions):
+        obs, _, *rest = super().step(actions)
+        kinds = {int: 0.25, np.ndarray: 0.5}
+        rewards = {agent: float(np.sum(action, dtype=np.float64)) + kinds[type(action)] for agent, action in actions.items()}
+        sizes = {agent: np.asarray(action).dtype.itemsize for agent, action in actions.items()}
+        return obs, {agent: reward + 64 * sizes[agent] for agent, reward in rewards.items()}, *rest
+
+
+def same(one, other):
+    """To the last bit, keys and types included."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one.keys() - {"t"}:
+            same(one[key], other[key])
+    else:
+        assert type(one) is type(other)
+        assert np.array_equal(one, other) and np.asarray(one).dtype == np.asarray(other).dtype
+
+
+@pytest.mark.parametrize("env_class", [ToyEnv, Sensitive, ScriptedEnv, PartneredEnv, partial(MaskedEnv, n_agents=3, limit=4)])
+def test_what_workers_send_equals_what_copies_here_return(env_class):
+    here, there = (make_team_env(env_class, n_envs=3, seed=2, vec_env=vec_env) for vec_env in ("dummy", "subproc"))
+    same(here.reset(), there.reset())
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        actions = {}
+        for agent, space in here.action_space.spaces.items():
+            space.seed(int(rng.integers(1000)))
+            actions[agent] = np.array([space.sample() for _ in range(3)])
+            if isinstance(space, spaces.Box):
+                # Not the space's own type
+                actions[agent] = np.float64(0.999) * actions[agent]
+        for agent, mask in (here.action_masks() or {}).items():
+            actions[agent] = mask.argmax(axis=1)
+        (obs, rewards, dones, infos), (obs2, rewards2, dones2, infos2) = here.step(actions), there.step(actions)
+        same({"obs": obs, "rewards": rewards, "dones": dones}, {"obs": obs2, "rewards": rewards2, "dones": dones2})
+        for info, info2 in zip(infos, infos2, strict=True):
+            same(info, info2)
+        if (masks := here.action_masks()) is not None:
+            same(masks, there.action_masks())
+    # What was handed out stays as it is, and may be written to
+    kept = [array.copy() for array in obs2.values()]
+    there.step(actions)
+    assert all(np.array_equal(array, copy) for array, copy in zip(obs2.values(), kept, strict=True))
+    assert all(array.flags.writeable for array in obs2.values())
+    there.close()
 
 
 def test_seed_is_used_once():
