@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
+PEERS_VENV := .venv-peers
+PEERS_STAMPS := $(patsubst %,$(PEERS_VENV)/%/.installed,rllib agilerl benchmarl)
 SOURCES := sb3_belief tests benchmarks train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
@@ -13,8 +15,8 @@ PYTEST_JOBS ?= auto
 CONFORMANCE_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench lint type format check-codestyle \
-	commit-checks clean
+.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench bench-peers lint type format \
+	check-codestyle commit-checks clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -50,6 +52,16 @@ conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our a
 bench: $(STAMP)  ## measure speed and memory (ten minutes), into benchmarks/out/bench.json
 	$(BIN)/python -m benchmarks.bench $(BENCH_ARGS)
 
+# each of the other libraries has an environment of its own; one that cannot be made is skipped, and its log says why
+$(PEERS_VENV)/%/.installed: benchmarks/peers/%.txt
+	$(PYTHON) -m venv $(PEERS_VENV)/$*
+	$(PEERS_VENV)/$*/bin/python -m pip install -r $< >$(PEERS_VENV)/$*.log 2>&1
+	@touch $@
+
+bench-peers: $(STAMP)  ## measure other libraries beside ours (an environment for each: 5 GB), into benchmarks/out/peers.json
+	-$(MAKE) --keep-going --no-print-directory $(PEERS_STAMPS)
+	$(BIN)/python -m benchmarks.peers $(BENCH_ARGS)
+
 # SMAX has an environment of its own: jaxmarl needs gymnasium<1.4, and its pins are those of Python 3.11
 $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
 	$(PYTHON) -m venv $(SMAX_VENV)
@@ -80,5 +92,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) $(SMAX_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) $(PEERS_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

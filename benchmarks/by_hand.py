@@ -15,6 +15,7 @@ from mpe2 import simple_spread_v3
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 
+from benchmarks.teams import SPREAD
 from sb3_belief.team import make_team_env
 from sb3_belief.team.lockstep import Lockstep
 
@@ -31,10 +32,10 @@ class ByHand:
 
     def __init__(self, n_envs: int, settings: dict[str, Any]) -> None:
         self.n_envs = n_envs
-        self.env = make_team_env(simple_spread_v3.parallel_env, n_envs=n_envs, seed=0)
+        self.env = make_team_env(SPREAD, n_envs=n_envs, seed=0)
         self.agents = self.env.possible_agents
         # Only for the models' spaces; it is never stepped
-        hub = Lockstep(make_team_env(simple_spread_v3.parallel_env, n_envs=n_envs))
+        hub = Lockstep(make_team_env(SPREAD, n_envs=n_envs))
         self.models: dict[str, PPO] = {}
         for k, agent in enumerate(self.agents):
             model = PPO("MlpPolicy", hub.agent_envs[agent], seed=k, device="cpu", **settings)

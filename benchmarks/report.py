@@ -71,10 +71,15 @@ class Report:
         :return: the measurements of each, round by round
         """
         samples = alternate(loops, self.rounds, 0 if self.quick else warmup)
-        self._add(part, samples, unit)
+        self.add_samples(part, samples, unit)
         return samples
 
-    def _add(self, part: str, samples: Mapping[str, Sequence[Sample]], unit: str) -> None:
+    def add_samples(self, part: str, samples: Mapping[str, Sequence[Sample]], unit: str) -> None:
+        """
+        :param part: of the benchmark
+        :param samples: measurements, by name
+        :param unit: what steps they count
+        """
         width = max(map(len, samples))
         print(f"  {'':{width}s} {unit + ' per CPU second':>30s} {'per wall second':>30s}   (quartiles)")
         for name, measured in samples.items():

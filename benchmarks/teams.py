@@ -10,7 +10,7 @@ from sb3_belief.zoo.config import RunConfig, load_config
 
 #: The beliefs that are compared; "ippo" is BeliefPPO without one
 ALGOS: dict[str, dict[str, Any]] = {"ippo": {"belief": "none"}, "belief_ppo": {"belief": "dynamic"}}
-SPREAD_ENVS = 8
+SPREAD, SPREAD_ENVS = "mpe/simple_spread_v3", 8
 
 
 def spread_settings(quick: bool) -> dict[str, Any]:
@@ -28,10 +28,7 @@ def spread_team(algo: str, quick: bool) -> Team:
     :param quick: see ``spread_settings``
     :return: three learners on simple_spread, all with SB3's default networks (64x64 tanh)
     """
-    # SMAX is measured in an environment without it
-    from mpe2 import simple_spread_v3
-
-    env = make_team_env(simple_spread_v3.parallel_env, n_envs=SPREAD_ENVS)
+    env = make_team_env(SPREAD, n_envs=SPREAD_ENVS)
     settings: dict[str, Any] = dict(seed=0, device="cpu", **spread_settings(quick))
     if algo == "ppo":
         return Team(PPO, "MlpPolicy", env, **settings)

@@ -1,5 +1,6 @@
 """mpe/<name>: a radius of sight hides teammates from observations and from what an agent is told of their actions."""
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,32 @@ def test_a_radius_as_wide_as_the_world_changes_nothing(name):
         a, b = plain.step(actions), wide.step(actions)
         assert a[1:4] == b[1:4]
     assert all(row.all() for row in wide.visibility().values())
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_everything_is_as_mpe2_has_it(name):
+    ours: Any = make_parallel_env(f"mpe/{name}")
+    theirs = import_module(f"mpe2.{name}").parallel_env()
+    assert ours.possible_agents == theirs.possible_agents
+    assert (ours.metadata, ours.state_space) == (theirs.metadata, theirs.state_space)
+    rng = np.random.default_rng(2)
+    for seed in (5, None):
+        results: list[Any] = [env.reset(seed=seed) for env in (ours, theirs)]
+        while theirs.agents:
+            np.testing.assert_equal(*results)
+            actions = random_actions(theirs, rng)
+            results = [env.step(actions) for env in (ours, theirs)]
+            assert ours.agents == theirs.agents
+        np.testing.assert_equal(*results)
+
+
+def test_wrong_actions_are_refused_by_the_team():
+    env = make_team_env("mpe/simple_spread_v3", n_envs=2)
+    env.reset()
+    actions = {agent: np.zeros(2, dtype=int) for agent in env.possible_agents}
+    actions["agent_1"][1] = 5
+    with pytest.raises(ValueError, match=r"agent_1.*Discrete\(5\)"):
+        env.step(actions)
 
 
 @pytest.mark.parametrize("name", sorted(set(ALL) - set(LAYOUTS)))
