@@ -38,20 +38,21 @@ def spread(report: Report) -> None:
     :param report: what is found goes there
     """
     # Here, since it imports mpe2: SMAX is measured in an environment without it
-    from benchmarks.by_hand import Bare, ByHand
+    from benchmarks.by_hand import ByHand, ByHandOnTeamEnv
 
     report.title("a", "three learners on simple_spread")
     quick, settings = report.quick, spread_settings(report.quick)
     loops: dict[str, Loop] = {
         "three PPOs by hand": ByHand(SPREAD_ENVS, settings).iterate,
-        "the same, bare environments": Bare(SPREAD_ENVS, settings).iterate,
+        "the same on the team's environment": ByHandOnTeamEnv(SPREAD_ENVS, settings).iterate,
         **{f"team of {algo}": TeamLoop(spread_team(algo, quick)) for algo in ("ppo", *ALGOS)},
     }
     samples = report.measure("a", loops)
-    hand, bare, ppo, ippo, belief = samples.values()
+    hand, same_env, ppo, ippo, belief = samples.values()
     report.add_ratio("lockstep_vs_hand", ratio(ppo, hand), "team of stock PPOs / three PPOs by hand")
-    report.add_ratio("lockstep_vs_bare", ratio(ppo, bare), "team of stock PPOs / by hand over bare environments")
     report.add_ratio("ippo_vs_hand", ratio(ippo, hand), "team of ippo / three PPOs by hand")
+    report.add_ratio("lockstep_vs_same_env", ratio(ppo, same_env), "team of stock PPOs / by hand on the team's environment")
+    report.add_ratio("ippo_vs_same_env", ratio(ippo, same_env), "team of ippo / by hand on the team's environment")
     report.add_ratio("belief_vs_ippo_spread", ratio(belief, ippo), "team of belief_ppo / team of ippo")
     breakdown.compare(report, "a", {algo: spread_team(algo, quick) for algo in ("ppo", *ALGOS)})
 

@@ -1,9 +1,10 @@
 """
 Three stock PPOs that learn on mpe2's simple_spread by a program of their own: what a team is compared with.
 
-- ``ByHand`` steps the same vectorised environment as the team: the difference is what lockstep and SB3's own rollout cost
-- ``Bare`` steps bare environments of just this kind (all agents always in play, one action type, every end a time limit, no
-  visibility, no infos): the difference is what a team costs altogether against a program for one environment only
+- ``ByHand`` is what one would write for this environment only: it steps copies of mpe2's own parallel environment (all agents
+  always in play, one action type, every end a time limit, no visibility, no infos)
+- ``ByHandOnTeamEnv`` steps the same vectorised environment as the team: the difference is what lockstep and SB3's own rollout
+  cost
 """
 
 from collections import deque
@@ -22,7 +23,7 @@ from sb3_belief.team.lockstep import Lockstep
 Advance = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, dict[int, dict[str, np.ndarray]]]
 
 
-class ByHand:
+class ByHandOnTeamEnv:
     """
     The policies, buffers and ``train()`` of three stock PPOs, with the loop over steps written out.
 
@@ -93,8 +94,8 @@ class ByHand:
         return obs, rewards, dones, {i: infos[i]["terminal_observation"] for i in np.flatnonzero(dones).tolist()}
 
 
-class Bare(ByHand):
-    """The same loop over bare environments."""
+class ByHand(ByHandOnTeamEnv):
+    """The same loop over environments of mpe2 as they are."""
 
     def _reset(self) -> dict[str, np.ndarray]:
         self.envs = [simple_spread_v3.parallel_env() for _ in range(self.n_envs)]

@@ -1,6 +1,7 @@
 """Actor-critic policies whose features hold a belief about the other agents."""
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,6 +14,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
+from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, DynamicBelief, History, expected_actions, kl_divergence
 from sb3_belief.belief_ppo.auxiliary import add_loss
@@ -41,6 +43,20 @@ def _fast_adam(optimizer_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
     given = {"eps": 1e-5} if optimizer_kwargs is None else dict(optimizer_kwargs)
     chosen = given.keys() & {"fused", "foreach", "capturable", "differentiable"}
     return given if chosen else {**given, "fused": True}
+
+
+class _Unchecked:
+    """
+    Lets torch's distributions leave out their checks, a fifth of a pass through a small network. Drawing from a discrete one
+    notices numbers that are none (NaN) by itself.
+    """
+
+    def __enter__(self) -> None:
+        self._before = Distribution._validate_args
+        Distribution.set_default_validate_args(False)
+
+    def __exit__(self, *_: object) -> None:
+        Distribution.set_default_validate_args(self._before)
 
 
 class BeliefPolicyMixin(_Policy):
@@ -235,11 +251,16 @@ class BeliefPolicyMixin(_Policy):
 
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 
+    def _distributions(self, trusted: bool = True) -> AbstractContextManager[None]:
+        """How torch's distributions are made within a pass."""
+        return _Unchecked() if trusted and not isinstance(self.action_space, spaces.Box) else nullcontext()
+
     def forward(self, obs: Any, deterministic: bool = False, *args: Any, **kwargs: Any) -> Any:
         if not self.has_belief:
-            return super().forward(obs, deterministic, *args, **kwargs)
+            with self._distributions(trusted=not deterministic):
+                return super().forward(obs, deterministic, *args, **kwargs)
         extractor = self._extractor
-        with extractor.conditioned(sample=not deterministic):
+        with extractor.conditioned(sample=not deterministic), self._distributions(trusted=not deterministic):
             result = super().forward(obs, deterministic, *args, **kwargs)
         output, noise = extractor.passing.output, extractor.passing.noise
         assert output is not None
@@ -261,9 +282,10 @@ class BeliefPolicyMixin(_Policy):
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         minibatch, self._minibatch = self._minibatch, None
         if not self.has_belief or minibatch is None:
-            return super().evaluate_actions(obs, actions, *args, **kwargs)
+            with self._distributions():
+                return super().evaluate_actions(obs, actions, *args, **kwargs)
         extractor = self._extractor
-        with extractor.conditioned(minibatch.noise, minibatch.kept):
+        with extractor.conditioned(minibatch.noise, minibatch.kept), self._distributions():
             values, log_prob, entropy = super().evaluate_actions(obs, actions, *args, **kwargs)
         loss = self.belief_loss(minibatch)
         extractor.passing.output = None  # it holds the graph of this minibatch
