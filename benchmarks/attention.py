@@ -16,24 +16,24 @@ import torch as th
 from benchmarks.measure import alternate, speeds
 from sb3_belief.belief.attention import attend
 
-Attention = Callable[[th.Tensor, th.Tensor, th.Tensor, th.Tensor, float], th.Tensor]
+Attention = Callable[[th.Tensor, th.Tensor, th.Tensor, float], th.Tensor]
 # Rows of a minibatch, rows of the history, kept ones, width
 SIZES = ((320, 800, 40, 64), (640, 800, 40, 64), (320, 6400, 320, 64))
 
 
-def recorded(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    scores = queries @ keys.T * scale
+def recorded(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
+    scores = queries @ rows.T * scale
     weights = scores.gather(1, kept).softmax(dim=1)
-    return th.zeros_like(scores).scatter(1, kept, weights) @ values
+    return th.zeros_like(scores).scatter(1, kept, weights) @ rows
 
 
-def gathered(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    weights = ((keys[kept] @ queries[:, :, None]).squeeze(2) * scale).softmax(dim=1)
-    return (weights[:, None] @ values[kept]).squeeze(1)
+def gathered(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
+    weights = ((rows[kept] @ queries[:, :, None]).squeeze(2) * scale).softmax(dim=1)
+    return (weights[:, None] @ rows[kept]).squeeze(1)
 
 
-def ours(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    return attend(queries, keys, values, kept, scale)[0]
+def ours(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
+    return attend(queries, rows, kept, scale)[0]
 
 
 WAYS: dict[str, Attention] = {"ours": ours, "recorded": recorded, "gathered": gathered}
@@ -47,12 +47,12 @@ def compare(sizes: tuple[int, int, int, int], rounds: int) -> tuple[dict[str, fl
     """
     th.manual_seed(0)
     n_queries, n_rows, n_kept, width = sizes
-    inputs = [th.randn(n, width, requires_grad=True) for n in (n_queries, n_rows, n_rows)]
+    inputs = [th.randn(n, width, requires_grad=True) for n in (n_queries, n_rows)]
     kept = th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices
     upstream = th.randn(n_queries, width)
 
     def run(way: Attention) -> list[th.Tensor]:
-        output = way(inputs[0], inputs[1], inputs[2], kept, width**-0.5)
+        output = way(inputs[0], inputs[1], kept, width**-0.5)
         return [output.detach(), *th.autograd.grad(output, inputs, upstream)]
 
     def loop(way: Attention) -> Callable[[], int]:

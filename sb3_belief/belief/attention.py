@@ -20,20 +20,17 @@ def largest(values: th.Tensor, n: int) -> th.Tensor:
     return th.from_numpy(np.ascontiguousarray(columns))
 
 
-def attend(
-    queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float
-) -> tuple[th.Tensor, th.Tensor]:
+def attend(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> tuple[th.Tensor, th.Tensor]:
     """
-    Each query's mean of the values of its kept rows, weighted by a softmax over the scaled products with their keys.
+    Each query's mean of its kept rows, weighted by a softmax over the scaled products with them.
 
     :param queries: ``[B, d]``
-    :param keys: ``[T, d]``
-    :param values: ``[T, d]``
+    :param rows: ``[T, d]``
     :param kept: The rows that each query attends to, no row twice, long ``[B, N]``, N at least 1
     :param scale: What the products are multiplied by
-    :return: The weighted sums ``[B, d]``, and the weights ``[B, N]``, which are to be looked at: no gradient flows from them
+    :return: The weighted means ``[B, d]``, and the weights ``[B, N]``, which are to be looked at: no gradient flows from them
     """
-    return _Attend.apply(queries, keys, values, kept, scale)
+    return _Attend.apply(queries, rows, kept, scale)
 
 
 class _Attend(th.autograd.Function):
@@ -45,27 +42,25 @@ class _Attend(th.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor, scale: float
-    ) -> tuple[th.Tensor, th.Tensor]:
-        weights = (queries @ keys.T).gather(1, kept).mul_(scale).softmax(dim=1)
-        ctx.save_for_backward(queries, keys, values, kept, weights)
+    def forward(ctx: Any, queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> tuple[th.Tensor, th.Tensor]:
+        weights = (queries @ rows.T).gather(1, kept).mul_(scale).softmax(dim=1)
+        ctx.save_for_backward(queries, rows, kept, weights)
         ctx.scale = scale
         ctx.mark_non_differentiable(weights)
-        return _sum_kept(values, kept, weights), weights
+        return _sum_kept(rows, kept, weights), weights
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        queries, keys, values, kept, weights = ctx.saved_tensors
-        grad_sums = grad_outputs[0]
-        dense = grad_sums @ values.T
+        queries, rows, kept, weights = ctx.saved_tensors
+        grad_means = grad_outputs[0]
+        dense = grad_means @ rows.T
         grad_weights = dense.gather(1, kept)
         grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True)) * ctx.scale
-        # One matrix for both sums over the queries: the second fills the places of the first
+        # Rows are averaged, and multiplied with queries. One matrix for both: the second fills the places of the first
         dense = dense.zero_().scatter_(1, kept, weights)
-        grad_values = dense.T @ grad_sums
-        grad_keys = dense.scatter_(1, kept, grad_scores).T @ queries
-        return _sum_kept(keys, kept, grad_scores), grad_keys, grad_values, None, None
+        grad_rows = dense.T @ grad_means
+        grad_rows.addmm_(dense.scatter_(1, kept, grad_scores).T, queries)
+        return _sum_kept(rows, kept, grad_scores), grad_rows, None, None
 
 
 def _sum_kept(rows: th.Tensor, kept: th.Tensor, weights: th.Tensor) -> th.Tensor:

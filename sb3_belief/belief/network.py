@@ -51,13 +51,11 @@ class HistoryContext(NamedTuple):
 
     :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``;
         None where the rows to attend to have been selected before
-    :param keys: ``[T, d]``
-    :param values: ``[T, d]``
+    :param states: Embedded observations and actions, ``[T, d]``
     """
 
     directions: th.Tensor | None
-    keys: th.Tensor
-    values: th.Tensor
+    states: th.Tensor
 
 
 def n_kept(keep_ratio: float, n_rows: int) -> int:
@@ -129,22 +127,21 @@ class DynamicBelief(nn.Module):
         """
         :return: All weights that the context of a history depends on
         """
-        for layer in (*self.observation_embedding, self.action_embedding, self.key, self.value):
+        for layer in (*self.observation_embedding, self.action_embedding):
             # Not parameters(), which looks for submodules: this is asked once a step
-            yield from (weight for weight in layer._parameters.values() if weight is not None)
+            yield from layer._parameters.values()
 
     def encode_history(self, history: History) -> HistoryContext:
         """
         :param history: The agent's history
-        :return: Its filled rows as directions, keys and values
+        :return: Its filled rows as directions and states
         """
         rows = history.filled()
         return self._encode_rows(rows, self.observation_embedding(rows.observations), to_compare=True)
 
     def _encode_rows(self, rows: History, embeddings: th.Tensor, to_compare: bool) -> HistoryContext:
-        states = embeddings + self.action_embedding(rows.actions)
         directions = F.normalize(self._compared(rows.observations, embeddings), dim=1) if to_compare else None
-        return HistoryContext(directions, self.key(states), self.value(states))
+        return HistoryContext(directions, embeddings + self.action_embedding(rows.actions))
 
     def forward(
         self,
@@ -214,9 +211,15 @@ class DynamicBelief(nn.Module):
         """
         Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
         names no softmax; "scaled" is read as in the transformer, by the root of the width.
+
+        Keys and values are linear in the states, so no row's are needed by themselves: the query goes to the states by way of
+        the keys' weights, and the mean of values is the value of the mean. That is fewer products wherever B < T.
         """
-        if kept.shape[1] > len(context.keys):
-            raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(context.keys)}; keep at most as many")
+        states = context.states
+        if kept.shape[1] > len(states):
+            raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(states)}; keep at most as many")
         if kept.shape[1] == 0:
             return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
-        return attend(self.query(embedding), context.keys, context.values, kept, 1 / math.sqrt(self.embedding_dim))
+        queries = self.query(embedding) @ self.key.weight
+        mean, weights = attend(queries, states, kept, 1 / math.sqrt(self.embedding_dim))
+        return self.value(mean), weights
