@@ -14,6 +14,7 @@ Parts:
 - ``e``: peak memory, each program in a process of its own
 - ``cores``: two cores against one
 - ``workers``: an environment whose step takes 10 ms, in worker processes (benchmarks/heavy.py)
+- ``gpu``: updates on a GPU against the CPU, where there is one
 
 One thread of torch. Speeds are joint steps (of one copy) per second of CPU time, that of workers included, and per second on
 the wall. Nothing fails for being slow: bars are printed beside the values. The JSON has the same numbers and more.
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import breakdown, cores, growth, heavy, memory
+from benchmarks import breakdown, cores, gpu, growth, heavy, memory
 from benchmarks.measure import Loop, ratio
 from benchmarks.report import Report
 from benchmarks.teams import ALGOS, SPREAD_ENVS, TeamLoop, has_smax, junction_team, smax_team, spread_settings, spread_team
@@ -93,6 +94,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "e": memory.run,
     "cores": cores.run,
     "workers": heavy.run,
+    "gpu": gpu.run,
 }
 
 

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+import torch as th
 
-from benchmarks import bench, heavy
+from benchmarks import bench, gpu, heavy
 from benchmarks.measure import Sample, alternate, ratio, spread
 from benchmarks.report import BARS, Report
 
@@ -69,6 +70,20 @@ def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
     assert ratio(fast, slow) == (2.0, 2.0, 2.0)
     assert ratio(fast, slow, "wall") == (1.0, 1.0, 1.0)
     assert spread([4.0, 1.0, 2.0, 3.0, 5.0]) == (3.0, 2.0, 4.0)
+
+
+def test_updates_are_timed_by_themselves():
+    report = Report(rounds=1, quick=True)
+    gpu.run(report, ("cpu", "cpu"))
+    assert report.time["update on cpu"]["ms_per_minibatch_of_all_agents"] > 0
+    assert report.ratio_rows["gpu_vs_cpu_update"]["median"] > 0
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_is_said_that_there_is_none():
+    report = Report(rounds=1, quick=True)
+    gpu.run(report)
+    assert "no GPU" in report.skipped["gpu"] and "gpu_vs_cpu_update" not in report.ratio_rows
 
 
 def test_a_bar_that_is_missed_fails_nothing(capsys):
