@@ -3,8 +3,8 @@ A team's agents on several cores.
 
 On-policy algorithms collect a rollout and then call ``train()``. Agents are independent, so these calls can run at once: while
 a team learns, ``train`` of each such model waits for the others', and is then run in this process or, with the model as it is,
-in a worker process. What was updated there also chooses its actions there, see ``acting``. What is learned, drawn
-and logged is the same, bit for bit.
+in a worker process. What was updated there also chooses its actions there, see ``acting``. What is learned, drawn and logged
+is the same, bit for bit.
 """
 
 from collections.abc import Iterator, Mapping
@@ -86,8 +86,8 @@ class Jobs:
         replaced: list[Any] = []
         try:
             for i, (agent, model) in enumerate(models.items()):
-                self._share_out(hub, agent, model, i % n_processes if (i + 1) % n_processes else None)
                 replaced += [model, model.policy]
+                self._share_out(hub, agent, model, i % n_processes if (i + 1) % n_processes else None)
             yield
         except BaseException:
             self._workers.end()
