@@ -1,4 +1,4 @@
-"""Two cores against one: the updates of Traffic Junction's ten agents with a belief, side by side or one after the other."""
+"""Two cores against one: Traffic Junction's ten agents with a belief, side by side or one after the other."""
 
 import torch as th
 

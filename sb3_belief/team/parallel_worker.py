@@ -6,9 +6,7 @@ one array. To pickle a step's dictionaries, arrays and records one by one, and t
 workers cost.
 """
 
-import multiprocessing
 import pickle
-import signal
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -20,6 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
 from sb3_belief.team.joint_env import JointEnv, StepRecord, mask_width
+from sb3_belief.team.processes import leave_interrupts_to_main, start_context
 
 # What a message with a step's actions begins with; all others are pickles, which do not begin so
 _STEP = b"s"
@@ -92,8 +91,7 @@ class WorkersVecEnv(SubprocVecEnv):
     def __init__(self, env_fns: list[Callable[[], JointEnv]]):
         self.waiting = self.closed = False
         # As SB3 starts its own workers: with another target, so its constructor is not called
-        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-        context: Any = multiprocessing.get_context(method)
+        context = start_context()
         self.remotes, self.work_remotes = zip(*[context.Pipe() for _ in env_fns], strict=True)
         self.processes = []
         for work_remote, remote, env_fn in zip(self.work_remotes, self.remotes, env_fns, strict=True):
@@ -219,8 +217,8 @@ def _serve(connection: Connection, parent_end: Connection, env_fn: CloudpickleWr
     :param parent_end: the other end
     :param env_fn: makes its copy
     """
-    # The terminal sends Ctrl-C to the whole group; SB3's loop would end and the environment with it
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # SB3's loop would end and the environment with it
+    leave_interrupts_to_main()
     # Before the environment, which may start processes of its own
     parent_end.close()
     env = env_fn.var()

@@ -3,7 +3,6 @@
 import io
 import queue
 import random
-import signal
 import threading
 import traceback
 import warnings
@@ -21,6 +20,7 @@ from torch import nn
 from sb3_belief.team.jobs.acting import do_pass
 from sb3_belief.team.jobs.messages import Message, dumps, loads, receive, send
 from sb3_belief.team.jobs.updating import STAYS, modules_of, optimizers_of, read_stream, tensors_of, write_stream
+from sb3_belief.team.processes import leave_interrupts_to_main
 
 # What PyTorch keeps in every module: parameters and submodules, which are looked at by themselves, and hooks
 _MODULE_KEYS = set(vars(nn.Module())) - {"training"}
@@ -33,8 +33,7 @@ def serve(connection: Connection) -> None:
 
     :param connection: brings jobs, one after the other, and takes their results
     """
-    # The terminal sends Ctrl-C to the whole group; it is the team's
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_interrupts_to_main()
     # The team sends without waiting for results, so both ways must always be free
     jobs: queue.SimpleQueue[tuple[Any, Any] | None] = queue.SimpleQueue()
     results: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()

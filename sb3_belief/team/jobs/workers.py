@@ -1,6 +1,5 @@
 """The worker processes of a team: started when they are needed, ended with it."""
 
-import multiprocessing
 import os
 import weakref
 from multiprocessing.connection import Connection
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 
 from sb3_belief.team.jobs.messages import receive, send
 from sb3_belief.team.jobs.worker import serve
+from sb3_belief.team.processes import await_message, start_context
 
 
 class _Worker(NamedTuple):
@@ -43,9 +43,7 @@ class Workers:
         """
         if any(not worker.process.is_alive() for worker in self._all):
             self.end()
-        methods = multiprocessing.get_all_start_methods()
-        # A process that has trained must not be forked: autograd has threads
-        context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        context = start_context()
         missing = range(len(self._all), n)
         for i in missing:
             here, there = context.Pipe()
@@ -62,10 +60,12 @@ class Workers:
         :param job: to do after those it has
         :raises RuntimeError: if the worker is dead
         """
-        worker = self._all[number]
-        worker.waiting.append(agent)
+        self._all[number].waiting.append(agent)
+        self._send(number, agent, job)
+
+    def _send(self, number: int, agent: str | None, content: Any) -> None:
         try:
-            send(worker.connection, agent, job)
+            send(self._all[number].connection, agent, content)
         except OSError as error:
             raise self._death(number) from error
 
@@ -90,10 +90,7 @@ class Workers:
                 worker.waiting.extend(worker.posted)
                 jobs = dict(worker.posted)
                 worker.posted.clear()
-                try:
-                    send(worker.connection, None, jobs)
-                except OSError as error:
-                    raise self._death(number) from error
+                self._send(number, None, jobs)
 
     def receive(self, number: int, agent: str) -> Any:
         """
@@ -105,10 +102,7 @@ class Workers:
         worker = self._all[number]
         while agent not in worker.arrived:
             try:
-                # Not every death of a process closes its connection
-                while not worker.connection.poll(1.0):
-                    if not worker.process.is_alive() and not worker.connection.poll(0):
-                        raise EOFError
+                await_message(worker.connection, worker.process)
                 whose, result = receive(worker.connection)
             except (EOFError, OSError) as error:
                 raise self._death(number) from error
