@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from benchmarks.measure import Loop, Sample, Spread, alternate, cores, speeds, spread
 from sb3_belief import versions as package
@@ -43,6 +43,9 @@ class Report:
     :param rounds: measurements of each loop
     :param quick: whether all was made tiny: then the numbers mean nothing
     """
+
+    #: By key of a ratio, see ``BARS``
+    bars: ClassVar[Mapping[str, tuple[str, float]]] = BARS
 
     rounds: int
     quick: bool
@@ -94,11 +97,11 @@ class Report:
 
     def add_ratio(self, key: str, found: Spread, text: str) -> None:
         """
-        :param key: of ``BARS``, or another: then it has no bar and is a detail
+        :param key: of ``bars``, or another: then it has no bar and is a detail
         :param found: the ratio and its spread
         :param text: what is divided by what
         """
-        bar = BARS.get(key)
+        bar = self.bars.get(key)
         if bar is not None:
             self.ratios[key] = found.median
         self.ratio_rows[key] = {**found._asdict(), "text": text, "bar": None if bar is None else f"{bar[0]} {bar[1]:g}"}
@@ -136,9 +139,17 @@ class Report:
             "skipped": self.skipped,
         }
         content = {"ratios": self.ratios, "peak_mib": self.peak_mib, "versions": versions(), "details": details}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=2) + "\n")
-        print(f"\nwritten: {path}")
+        write_json(content, path)
+
+
+def write_json(content: Mapping[str, Any], path: Path) -> None:
+    """
+    :param content: of the file
+    :param path: of the file, whose folder is made if it is missing
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=2) + "\n")
+    print(f"\nwritten: {path}")
 
 
 def versions() -> dict[str, Any]:
