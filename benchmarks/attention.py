@@ -16,24 +16,24 @@ import torch as th
 from benchmarks.measure import alternate, speeds
 from sb3_belief.belief.attention import attend
 
-Attention = Callable[[th.Tensor, th.Tensor, th.Tensor, float], th.Tensor]
+Attention = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
 # Rows of a minibatch, rows of the history, kept ones, width
-SIZES = ((320, 800, 40, 64), (640, 800, 40, 64), (320, 6400, 320, 64))
+SIZES = ((256, 800, 40, 64), (640, 800, 40, 64), (256, 6400, 320, 64))
 
 
-def recorded(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    scores = queries @ rows.T * scale
-    weights = scores.gather(1, kept).softmax(dim=1)
-    return th.zeros_like(scores).scatter(1, kept, weights) @ rows
+def recorded(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor) -> th.Tensor:
+    scores = queries @ rows.T
+    weights = scores.gather(1, kept.long()).softmax(dim=1)
+    return th.zeros_like(scores).scatter(1, kept.long(), weights) @ rows
 
 
-def gathered(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    weights = ((rows[kept] @ queries[:, :, None]).squeeze(2) * scale).softmax(dim=1)
+def gathered(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor) -> th.Tensor:
+    weights = (rows[kept] @ queries[:, :, None]).squeeze(2).softmax(dim=1)
     return (weights[:, None] @ rows[kept]).squeeze(1)
 
 
-def ours(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> th.Tensor:
-    return attend(queries, rows, kept, scale)[0]
+def ours(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor) -> th.Tensor:
+    return attend(queries, rows, rows, kept)[0]
 
 
 WAYS: dict[str, Attention] = {"ours": ours, "recorded": recorded, "gathered": gathered}
@@ -47,12 +47,12 @@ def compare(sizes: tuple[int, int, int, int], rounds: int) -> tuple[dict[str, fl
     """
     th.manual_seed(0)
     n_queries, n_rows, n_kept, width = sizes
-    inputs = [th.randn(n, width, requires_grad=True) for n in (n_queries, n_rows)]
-    kept = th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices
+    inputs = [(width**-0.25 * th.randn(n, width)).requires_grad_() for n in (n_queries, n_rows)]
+    kept = th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices.sort(dim=1).values.int()
     upstream = th.randn(n_queries, width)
 
     def run(way: Attention) -> list[th.Tensor]:
-        output = way(inputs[0], inputs[1], kept, width**-0.5)
+        output = way(inputs[0], inputs[1], kept)
         return [output.detach(), *th.autograd.grad(output, inputs, upstream)]
 
     def loop(way: Attention) -> Callable[[], int]:

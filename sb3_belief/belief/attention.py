@@ -1,68 +1,118 @@
 """Attention to a few selected rows (eq. 4 of the paper), with a backward pass of its own."""
 
+import warnings
 from typing import Any
 
 import numpy as np
 import torch as th
 import torch.nn.functional as F
 
+with warnings.catch_warnings():
+    # PyTorch says once that its sparse tensors are in beta state; what is used of them here is tested
+    warnings.filterwarnings("ignore", "Sparse CSR tensor support")
+    _none = th.zeros(0, dtype=th.int)
+    th.sparse_csr_tensor(th.zeros(2, dtype=th.int), _none, th.zeros(0), size=(1, 1), check_invariants=False)
+
 
 def largest(values: th.Tensor, n: int) -> th.Tensor:
     """
     :param values: ``[B, T]``, no gradient flows from them
     :param n: How many are wanted, at most T
-    :return: Where the largest values of each row stand, in no particular order, long ``[B, n]``
+    :return: Where the largest values of each row stand, in ascending order, int32 ``[B, n]``
     """
     if n == 0 or values.device.type != "cpu":
-        return values.topk(n, dim=1, sorted=False).indices
+        return values.topk(n, dim=1, sorted=False).indices.int().sort(dim=1).values
     # A third of the time of topk()
-    columns = np.argpartition(values.detach().numpy(), -n, axis=1)[:, -n:]
-    return th.from_numpy(np.ascontiguousarray(columns))
+    columns = np.argpartition(values.detach().numpy(), -n, axis=1)[:, -n:].astype(np.int32)
+    columns.sort(axis=1)
+    return th.from_numpy(columns)
 
 
-def attend(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> tuple[th.Tensor, th.Tensor]:
+def attend(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Each query's mean of its kept rows, weighted by a softmax over the scaled products with them.
+    Each query's mean of the values of its kept rows, weighted by a softmax over its products with their keys.
 
     :param queries: ``[B, d]``
-    :param rows: ``[T, d]``
-    :param kept: The rows that each query attends to, no row twice, long ``[B, N]``, N at least 1
-    :param scale: What the products are multiplied by
-    :return: The weighted means ``[B, d]``, and the weights ``[B, N]``, which are to be looked at: no gradient flows from them
+    :param keys: ``[T, d]``
+    :param values: ``[T, v]``
+    :param kept: The rows that each query attends to, in ascending order and none twice, int32 ``[B, N]``
+    :return: The weighted means ``[B, v]``, zero where N is 0, and the weights ``[B, N]``, which are to be looked at: no
+        gradient flows from them
+    :raises ValueError: if more rows are to be kept than there are
     """
-    return _Attend.apply(queries, rows, kept, scale)
+    if kept.shape[1] > len(keys):
+        raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(keys)}; keep at most as many")
+    if kept.shape[1] == 0:
+        return queries.new_zeros(len(queries), values.shape[1]), queries.new_zeros(kept.shape)
+    if th.is_grad_enabled():
+        return _Attend.apply(queries, keys, values, kept)
+    # For the few queries of a rollout a product with all keys is quicker than naming the wanted ones
+    weights = (queries @ keys.T).gather(1, kept.long()).softmax(dim=1)
+    return _sums(values, kept, weights), weights
 
 
 class _Attend(th.autograd.Function):
     """
-    Softmax attention with the usual gradient. Written out because the graph that PyTorch would record takes half as long
-    again: it keeps and passes through several [B, T] matrices, of which the backward pass here needs one. Products with all
-    rows are dense matrix products (on a CPU these are faster than gathering [B, N, d]); sums over the kept rows are
-    `embedding_bag`, which touches no other. benchmarks/attention.py measures it against both alternatives.
+    Softmax attention with the usual gradient. Written out because what PyTorch would record multiplies each query with all
+    rows, and each row with all queries, although a twentieth of these products is wanted; and gathering [B, N, d] to have the
+    wanted ones only takes longer still. benchmarks/attention.py measures it against both.
     """
 
     @staticmethod
-    def forward(ctx: Any, queries: th.Tensor, rows: th.Tensor, kept: th.Tensor, scale: float) -> tuple[th.Tensor, th.Tensor]:
-        weights = (queries @ rows.T).gather(1, kept).mul_(scale).softmax(dim=1)
-        ctx.save_for_backward(queries, rows, kept, weights)
-        ctx.scale = scale
+    def forward(
+        ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        weights = _products(queries, keys, kept).softmax(dim=1)
+        ctx.save_for_backward(queries, keys, values, kept, weights)
         ctx.mark_non_differentiable(weights)
-        return _sum_kept(rows, kept, weights), weights
+        return _sums(values, kept, weights), weights
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        queries, rows, kept, weights = ctx.saved_tensors
+        queries, keys, values, kept, weights = ctx.saved_tensors
         grad_means = grad_outputs[0]
-        dense = grad_means @ rows.T
-        grad_weights = dense.gather(1, kept)
-        grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True)) * ctx.scale
-        # Rows are averaged, and multiplied with queries. One matrix for both: the second fills the places of the first
-        dense = dense.zero_().scatter_(1, kept, weights)
-        grad_rows = dense.T @ grad_means
-        grad_rows.addmm_(dense.scatter_(1, kept, grad_scores).T, queries)
-        return _sum_kept(rows, kept, grad_scores), grad_rows, None, None
+        grad_weights = _products(grad_means, values, kept)
+        grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True))
+        by_row = _ByRow(kept, len(keys))
+        grad_keys, grad_values = by_row.sums(queries, grad_scores), by_row.sums(grad_means, weights)
+        return _sums(keys, kept, grad_scores), grad_keys, grad_values, None
 
 
-def _sum_kept(rows: th.Tensor, kept: th.Tensor, weights: th.Tensor) -> th.Tensor:
+def _products(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor) -> th.Tensor:
+    """Products of each query with its kept rows, ``[B, N]``."""
+    starts = th.arange(0, kept.numel() + 1, kept.shape[1], dtype=kept.dtype, device=kept.device)
+    wanted = th.sparse_csr_tensor(
+        starts, kept.flatten(), queries.new_zeros(kept.numel()), size=(len(queries), len(rows)), check_invariants=False
+    )
+    return th.sparse.sampled_addmm(wanted, queries, rows.T).values().view(kept.shape)
+
+
+def _sums(rows: th.Tensor, kept: th.Tensor, weights: th.Tensor) -> th.Tensor:
     """Sums of the kept rows by these weights, ``[B, d]``."""
     return F.embedding_bag(kept, rows, per_sample_weights=weights, mode="sum")
+
+
+class _ByRow:
+    """
+    Which queries keep each row, to sum over them.
+
+    :param kept: ``[B, N]``
+    :param n_rows: T
+    """
+
+    def __init__(self, kept: th.Tensor, n_rows: int) -> None:
+        # On a CPU numpy's sort of short integers takes a tenth of PyTorch's time
+        if kept.device.type == "cpu":
+            rows = kept.numpy().ravel().astype(np.uint16 if n_rows <= 2**16 else np.int32)
+            self._order = th.from_numpy(rows.argsort(kind="stable"))
+            counts = th.from_numpy(np.bincount(rows, minlength=n_rows))
+        else:
+            self._order = kept.flatten().argsort(stable=True)
+            counts = kept.flatten().bincount(minlength=n_rows)
+        self._queries = (self._order // kept.shape[1]).int()
+        self._starts = (counts.cumsum(0) - counts).int()
+
+    def sums(self, queries: th.Tensor, weights: th.Tensor) -> th.Tensor:
+        """For each row the sum of the queries that keep it, by these weights ``[B, N]``: ``[T, d]``."""
+        by_row = weights.flatten().index_select(0, self._order)
+        return F.embedding_bag(self._queries, queries, self._starts, per_sample_weights=by_row, mode="sum")

@@ -32,7 +32,7 @@ class BeliefOutput(NamedTuple):
     :param log_std: Log standard deviation of its distribution, ``[B, z]``; minus infinity where it is a single point
     :param prediction: The others' predicted actions, flattened, ``[B, W]``: numbers or logits, whatever the loss makes of
         them; None for a belief that predicts nothing
-    :param kept: The history rows attended to, as indices into the rows filled so far, long ``[B, N_h]``;
+    :param kept: The history rows attended to, as indices into the rows filled so far, int32 ``[B, N_h]``;
         ``N_h`` is 0 while the history is empty, and for a belief without one
     :param weights: Their attention weights, ``[B, N_h]``, each row sums to one
     """
@@ -49,13 +49,14 @@ class HistoryContext(NamedTuple):
     """
     A history as the network sees it; constant as long as neither the history nor the weights change.
 
-    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``;
-        None where the rows to attend to have been selected before
-    :param states: Embedded observations and actions, ``[T, d]``
+    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``
+    :param keys: Keys of the rows, ``[T, d]``, divided by the root of the width
+    :param values: Values of the rows, ``[T, d]``
     """
 
-    directions: th.Tensor | None
-    states: th.Tensor
+    directions: th.Tensor
+    keys: th.Tensor
+    values: th.Tensor
 
 
 def n_kept(keep_ratio: float, n_rows: int) -> int:
@@ -127,21 +128,20 @@ class DynamicBelief(nn.Module):
         """
         :return: All weights that the context of a history depends on
         """
-        for layer in (*self.observation_embedding, self.action_embedding):
+        for layer in (*self.observation_embedding, self.action_embedding, self.key, self.value):
             # Not parameters(), which looks for submodules: this is asked once a step
-            yield from layer._parameters.values()
+            yield from (weights for weights in layer._parameters.values() if weights is not None)
 
     def encode_history(self, history: History) -> HistoryContext:
         """
         :param history: The agent's history
-        :return: Its filled rows as directions and states
+        :return: Its filled rows as directions, keys and values
         """
         rows = history.filled()
-        return self._encode_rows(rows, self.observation_embedding(rows.observations), to_compare=True)
-
-    def _encode_rows(self, rows: History, embeddings: th.Tensor, to_compare: bool) -> HistoryContext:
-        directions = F.normalize(self._compared(rows.observations, embeddings), dim=1) if to_compare else None
-        return HistoryContext(directions, embeddings + self.action_embedding(rows.actions))
+        embeddings = self.observation_embedding(rows.observations)
+        states = embeddings + self.action_embedding(rows.actions)
+        directions = F.normalize(self._compared(rows.observations, embeddings), dim=1)
+        return HistoryContext(directions, self.key(states) / math.sqrt(self.embedding_dim), self.value(states))
 
     def forward(
         self,
@@ -150,6 +150,7 @@ class DynamicBelief(nn.Module):
         noise: th.Tensor | None = None,
         kept: th.Tensor | None = None,
         context: HistoryContext | None = None,
+        predict: bool = True,
     ) -> BeliefOutput:
         """
         :param observations: ``[B, d_o]``
@@ -159,27 +160,23 @@ class DynamicBelief(nn.Module):
         :param kept: The rows to attend to, ``[B, N_h]``, if they have been selected before; by default those most
             similar to each observation are selected here (eq. 3)
         :param context: ``encode_history(history)``, if it is at hand
+        :param predict: Whether the others' actions are wanted
         :return: The belief and all that belongs to it
         :raises ValueError: if a variant that attends is given no history, or more rows are to be kept than it has
         """
+        embedding = self.observation_embedding(observations)
         if self.variant.attends:
-            if context is not None:
-                embedding = self.observation_embedding(observations)
-            elif history is not None:
-                # In one pass with the observations: few large matrix products are faster than many small ones
-                rows = history.filled()
-                both = self.observation_embedding(th.cat([observations, rows.observations]))
-                embedding, embeddings = both.split([len(observations), len(rows.observations)])
-                context = self._encode_rows(rows, embeddings, to_compare=kept is None)
-            else:
+            if context is None and history is None:
                 raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
-            if kept is None:
-                kept = self._most_similar(observations, embedding, context)
-            summary, weights = self._attend(embedding, context, kept)
+            if context is None and kept is not None:
+                summary, weights = self._attend_to_states(embedding, history.filled(), kept)  # type: ignore[union-attr]
+            else:
+                context = context or self.encode_history(history)  # type: ignore[arg-type]
+                kept = self._most_similar(observations, embedding, context) if kept is None else kept
+                summary, weights = attend(self.query(embedding), context.keys, context.values, kept)
             embedding = embedding + summary
         else:
-            embedding = self.observation_embedding(observations)
-            kept = th.zeros(len(observations), 0, dtype=th.long, device=observations.device)
+            kept = th.zeros(len(observations), 0, dtype=th.int, device=observations.device)
             weights = embedding.new_zeros(kept.shape)
         encoded = self.encoder(embedding)
         if self.variant.samples:
@@ -190,7 +187,7 @@ class DynamicBelief(nn.Module):
         else:
             latent = mean = encoded
             log_std = th.full_like(mean, -math.inf)
-        prediction = self.decoder(latent) if self.variant.predicts else None
+        prediction = self.decoder(latent) if predict and self.variant.predicts else None
         return BeliefOutput(latent, mean, log_std, prediction, kept, weights)
 
     def _compared(self, observations: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
@@ -202,24 +199,16 @@ class DynamicBelief(nn.Module):
         Eq. 3, with the sign that its text asks for: printed, the equation keeps the *least* similar rows. The choice
         is discrete, so no gradient flows through it.
         """
-        assert context.directions is not None
         # The length of the present one changes nothing in the order, so only the rows' directions are needed
         similarity = self._compared(observations, embeddings) @ context.directions.T
         return largest(similarity, n_kept(self.keep_ratio, similarity.shape[1]))
 
-    def _attend(self, embedding: th.Tensor, context: HistoryContext, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _attend_to_states(self, embedding: th.Tensor, rows: History, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
-        names no softmax; "scaled" is read as in the transformer, by the root of the width.
-
-        Keys and values are linear in the states, so no row's are needed by themselves: the query goes to the states by way of
-        the keys' weights, and the mean of values is the value of the mean. That is fewer products wherever B < T.
+        The same without keys and values of all rows, which are linear in the states: the query goes to the states by way of
+        the keys' weights, and the mean of values is the value of the mean. In one pass these are fewer products where B < T.
         """
-        states = context.states
-        if kept.shape[1] > len(states):
-            raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(states)}; keep at most as many")
-        if kept.shape[1] == 0:
-            return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
-        queries = self.query(embedding) @ self.key.weight
-        mean, weights = attend(queries, states, kept, 1 / math.sqrt(self.embedding_dim))
+        states = self.observation_embedding(rows.observations) + self.action_embedding(rows.actions)
+        queries = self.query(embedding) @ (self.key.weight / math.sqrt(self.embedding_dim))
+        mean, weights = attend(queries, states, states, kept)
         return self.value(mean), weights

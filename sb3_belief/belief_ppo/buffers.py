@@ -162,12 +162,8 @@ class BeliefBufferMixin(_Buffer):
         :param rows: Index into the rows as they are ordered at present
         :return: The belief's part of these rows, on the buffer's device
         """
-        return BeliefMinibatch(
-            noise=self.to_torch(self.noise[rows]),
-            kept=self.to_torch(self.kept[rows][..., : self._n_kept]).long(),
-            others_actions=self.to_torch(self.others_actions[rows]),
-            others_visible=self.to_torch(self.others_visible[rows]),
-        )
+        parts = self.noise[rows], self.kept[rows][..., : self._n_kept], self.others_actions[rows], self.others_visible[rows]
+        return BeliefMinibatch(*(th.as_tensor(np.ascontiguousarray(part), device=self.device) for part in parts))
 
 
 class BeliefRolloutBuffer(BeliefBufferMixin, RolloutBuffer):

@@ -135,7 +135,8 @@ class BeliefExtractor(BaseFeaturesExtractor):
         flat = flatten_observation(observations)
         if sample and self.belief.variant.samples:
             noise = th.randn(len(flat), self.belief.latent_dim, device=flat.device)
-        output = self.infer(flat, noise, kept)
+        # Whoever acts asks for no prediction
+        output = self.infer(flat, noise, kept, predict=th.is_grad_enabled())
         self.passing.output, self.passing.noise = output, noise
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
@@ -143,16 +144,19 @@ class BeliefExtractor(BaseFeaturesExtractor):
             latent = latent.detach()
         return BeliefFeatures(self.features(observations), latent)
 
-    def infer(self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None) -> BeliefOutput:
+    def infer(
+        self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None, predict: bool = True
+    ) -> BeliefOutput:
         """
         :param flat: Preprocessed flat observations, ``[B, d_o]``
         :param noise: The noise of eq. 5, ``[B, z]``; without it the belief is its mean
         :param kept: The history rows to attend to, ``[B, N_h]``; without them the most similar ones
+        :param predict: Whether the others' actions are wanted
         :return: The belief, from the present history
         """
         history = self.history
         context = None if history is None or th.is_grad_enabled() else self._cached_context(history)
-        return self.belief(flat, history, noise, kept, context)
+        return self.belief(flat, history, noise, kept, context, predict)
 
     def _cached_context(self, history: History) -> HistoryContext:
         """

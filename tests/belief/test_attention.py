@@ -1,54 +1,103 @@
 """The attention's own backward pass, against the graph that PyTorch records."""
 
+import subprocess
+import sys
+
 import pytest
 import torch as th
 
 from sb3_belief.belief.attention import attend, largest
 
 
-def plain(queries, rows, kept, scale):
+def plain(queries, keys, values, kept):
     """Eq. 4, row by row."""
     means = []
-    for query, own in zip(queries, kept, strict=True):
-        weights = (rows[own] @ query * scale).softmax(dim=0)
-        means.append(weights @ rows[own])
+    for query, own in zip(queries, kept.long(), strict=True):
+        weights = (keys[own] @ query).softmax(dim=0)
+        means.append(weights @ values[own])
     return th.stack(means)
 
 
+def chosen(n_queries, n_rows, n_kept):
+    return th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices.sort(dim=1).values.int()
+
+
 @pytest.mark.parametrize("n_queries, n_rows, n_kept, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2)])
-def test_gradients_of_queries_and_rows(n_queries, n_rows, n_kept, width):
+def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_kept, width):
     th.manual_seed(0)
-    inputs = [th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows)]
-    queries, rows = inputs
-    kept = th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices
-    assert th.autograd.gradcheck(lambda q, r: attend(q, r, kept, 0.7)[0], inputs)
-    upstream = th.randn(n_queries, width, dtype=th.float64)
-    found = th.autograd.grad(attend(queries, rows, kept, 0.7)[0], inputs, upstream)
-    expected = th.autograd.grad(plain(queries, rows, kept, 0.7), inputs, upstream)
+    queries, keys = (th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows))
+    values = th.randn(n_rows, width + 1, dtype=th.float64, requires_grad=True)
+    inputs = [queries, keys, values]
+    kept = chosen(n_queries, n_rows, n_kept)
+    assert th.autograd.gradcheck(lambda q, k, v: attend(q, k, v, kept)[0], inputs)
+    upstream = th.randn(n_queries, width + 1, dtype=th.float64)
+    found = th.autograd.grad(attend(queries, keys, values, kept)[0], inputs, upstream)
+    expected = th.autograd.grad(plain(queries, keys, values, kept), inputs, upstream)
     for ours, theirs in zip(found, expected, strict=True):
         th.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_rows", [2**16, 2**16 + 1])
+def test_gradients_of_more_rows_than_short_integers_count(n_rows):
+    th.manual_seed(0)
+    rows = th.randn(n_rows, 2, requires_grad=True)
+    queries, kept = th.randn(2, 2), th.tensor([[0, n_rows - 1], [1, n_rows - 1]], dtype=th.int)
+    (found,) = th.autograd.grad(attend(queries, rows, rows, kept)[0].sum(), rows)
+    (expected,) = th.autograd.grad(plain(queries, rows, rows, kept).sum(), rows)
+    th.testing.assert_close(found, expected)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_gradients_are_the_same_on_a_gpu():
+    th.manual_seed(0)
+    kept, upstream = chosen(64, 200, 10), th.randn(64, 8)
+    queries, keys, values = (th.randn(n, 8, requires_grad=True) for n in (64, 200, 200))
+    expected = th.autograd.grad(attend(queries, keys, values, kept)[0], [queries, keys, values], upstream)
+    queries, keys, values = (tensor.detach().cuda().requires_grad_() for tensor in (queries, keys, values))
+    means, _ = attend(queries, keys, values, kept.cuda())
+    found = th.autograd.grad(means, [queries, keys, values], upstream.cuda())
+    for ours, theirs in zip(found, expected, strict=True):
+        th.testing.assert_close(ours.cpu(), theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_weights_are_a_distribution_over_the_kept_rows_and_carry_no_gradient():
     th.manual_seed(0)
     queries, rows = (th.randn(n, 3, requires_grad=True) for n in (4, 8))
-    kept = th.rand(4, 8).topk(2, dim=1).indices
-    means, weights = attend(queries, rows, kept, 1.0)
+    kept = chosen(4, 8, 2)
+    means, weights = attend(queries, rows, rows, kept)
     th.testing.assert_close(weights.sum(dim=1), th.ones(4))
-    th.testing.assert_close((weights[:, :, None] * rows[kept]).sum(dim=1), means)
+    th.testing.assert_close((weights[:, :, None] * rows[kept.long()]).sum(dim=1), means)
     assert means.requires_grad and not weights.requires_grad
 
 
+def test_without_gradients_the_result_is_the_same():
+    th.manual_seed(0)
+    queries, keys, values = (th.randn(n, 3) for n in (4, 8, 8))
+    kept = chosen(4, 8, 2)
+    recorded = attend(queries, keys, values, kept)
+    with th.no_grad():
+        th.testing.assert_close(attend(queries, keys, values, kept), recorded)
+
+
 def test_a_row_that_nobody_keeps_gets_no_gradient():
-    rows = th.randn(5, 3, requires_grad=True)
-    attend(th.randn(2, 3), rows, th.tensor([[0, 1], [1, 3]]), 1.0)[0].sum().backward()
-    assert rows.grad is not None
-    assert not rows.grad[[2, 4]].any() and rows.grad[1].any()
+    keys, values = (th.randn(5, 3, requires_grad=True) for _ in range(2))
+    attend(th.randn(2, 3), keys, values, th.tensor([[0, 1], [1, 3]]))[0].sum().backward()
+    for rows in (keys, values):
+        assert rows.grad is not None
+        assert not rows.grad[[2, 4]].any() and rows.grad[1].any()
+
+
+def test_nobody_is_told_of_sparse_tensors():
+    program = (
+        "import torch as th; from sb3_belief.belief.attention import attend;"
+        "rows = th.ones(2, 2, requires_grad=True); attend(rows, rows, rows, th.tensor([[0], [1]]))[0].sum().backward()"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 8])
 def test_the_largest_are_those_of_a_sort(n):
     values = th.randn(6, 8, generator=th.Generator().manual_seed(0), requires_grad=True)
     found = largest(values, n)
-    assert found.shape == (6, n) and found.dtype == th.long and found.is_contiguous()
-    assert found.sort(dim=1).values.equal(values.argsort(dim=1)[:, 8 - n :].sort(dim=1).values)
+    assert found.shape == (6, n) and found.dtype == th.int and found.is_contiguous()
+    assert found.equal(values.argsort(dim=1)[:, 8 - n :].sort(dim=1).values.int())

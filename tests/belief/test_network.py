@@ -88,7 +88,7 @@ def test_no_gradient_flows_through_the_choice_of_rows(similarity):
     for a, b in zip(*gradients, strict=True):
         th.testing.assert_close(a, b)
     directions = net.encode_history(history).directions
-    assert directions is not None and not directions.requires_grad
+    assert not directions.requires_grad
 
 
 @pytest.mark.parametrize("widths", [(64, 64), (16, 8), (8, 32), (1, 1)])
