@@ -7,7 +7,6 @@ predicted (eq. 5 to 7).
 """
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch as th
@@ -124,13 +123,13 @@ class DynamicBelief(nn.Module):
         beyond_embedding = (w + 1) * d + 3 * d**2 + (d + 1) * 2 * z + (z + 1) * w
         return max(1, round((beyond_embedding - z) / (d + 1 + z)))
 
-    def context_parameters(self) -> Iterator[th.Tensor]:
+    def context_parameters(self) -> list[th.Tensor]:
         """
         :return: All weights that the context of a history depends on
         """
-        for layer in (*self.observation_embedding, self.action_embedding, self.key, self.value):
-            # Not parameters(), which looks for submodules: this is asked once a step
-            yield from (weights for weights in layer._parameters.values() if weights is not None)
+        # Not parameters(), which looks for submodules: this is asked once a step
+        layers = (*self.observation_embedding, self.action_embedding, self.key, self.value)
+        return [weights for layer in layers for weights in layer._parameters.values() if weights is not None]
 
     def encode_history(self, history: History) -> HistoryContext:
         """

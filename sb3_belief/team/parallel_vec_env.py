@@ -14,7 +14,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from sb3_belief.team.checks import StepChecks
 from sb3_belief.team.joint_env import JointEnv, mask_width
 from sb3_belief.team.parallel_worker import WorkersVecEnv, step_and_reset
-from sb3_belief.team.processes import await_message
 from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv, check_spaces
 
 
@@ -173,8 +172,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
     @staticmethod
     def _await_workers(venv: WorkersVecEnv) -> None:
         # The last to start is likely the last to finish: to wait for it first is to be woken once
-        for remote, process in reversed(list(zip(venv.remotes, venv.processes, strict=True))):
-            await_message(remote, process)
+        for inbox in reversed(venv.inboxes):
+            inbox.wait()
 
     def _finish_interrupted_step(self) -> None:
         if isinstance(self.venv, WorkersVecEnv) and self.venv.waiting:

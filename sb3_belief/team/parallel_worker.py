@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
 from sb3_belief.team.joint_env import JointEnv, StepRecord, mask_width
-from sb3_belief.team.processes import leave_interrupts_to_main, start_context
+from sb3_belief.team.processes import Inbox, leave_interrupts_to_main, start_context
 
 # What a message with a step's actions begins with; all others are pickles, which do not begin so
 _STEP = b"s"
@@ -99,6 +99,7 @@ class WorkersVecEnv(SubprocVecEnv):
             process.start()
             self.processes.append(process)
             work_remote.close()
+        self.inboxes = [Inbox(remote, process) for remote, process in zip(self.remotes, self.processes, strict=True)]
         self.remotes[0].send(("get_spaces", None))
         VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
         self._agents: list[str] = []

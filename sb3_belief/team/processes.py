@@ -1,7 +1,9 @@
 """What all worker processes of a team have in common."""
 
 import multiprocessing
+import select
 import signal
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,15 +20,30 @@ def leave_interrupts_to_main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def await_message(connection: Connection, process: Any) -> None:
+class Inbox:
     """
-    Wait until there is something to receive. Whether the death of a process closes its pipe depends on the start method
-    (forked siblings hold copies of it), so a plain ``recv()`` could wait for ever.
+    Where the main process waits for what a worker sends.
 
-    :param connection: to a worker
+    :param connection: to the worker
     :param process: the worker
-    :raises EOFError: if it is dead and has left nothing
     """
-    while not connection.poll(1.0):
-        if not process.is_alive() and not connection.poll(0):
-            raise EOFError
+
+    def __init__(self, connection: Connection, process: Any) -> None:
+        self._process = process
+        self._arrives_within: Callable[[float], bool] = connection.poll
+        if hasattr(select, "poll"):
+            # Connection.poll() registers with the system at each call, which takes most of its time
+            poll = select.poll()
+            poll.register(connection.fileno(), select.POLLIN)
+            self._arrives_within = lambda seconds: bool(poll.poll(1000 * seconds))
+
+    def wait(self) -> None:
+        """
+        Wait until there is something to receive. Whether the death of a process closes its pipe depends on who else holds a
+        copy of that (a process that the worker has started, say), so a plain ``recv()`` could wait for ever.
+
+        :raises EOFError: if the worker is dead and has left nothing
+        """
+        while not self._arrives_within(1.0):
+            if not self._process.is_alive() and not self._arrives_within(0.0):
+                raise EOFError

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 from sb3_belief.team.jobs.messages import receive, send
 from sb3_belief.team.jobs.worker import serve
-from sb3_belief.team.processes import await_message, start_context
+from sb3_belief.team.processes import Inbox, start_context
 
 
 class _Worker(NamedTuple):
     """
     :param process: itself
     :param connection: to it
+    :param inbox: of that connection
     :param waiting: agents whose jobs it has been given, in order
     :param arrived: {agent: result that has been read before it was asked for}
     :param posted: {agent: small job that is to be sent with others}
@@ -21,6 +22,7 @@ class _Worker(NamedTuple):
 
     process: Any
     connection: Connection
+    inbox: Inbox
     waiting: list[str]
     arrived: dict[str, Any]
     posted: dict[str, Any]
@@ -50,7 +52,7 @@ class Workers:
             process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
             process.start()
             there.close()
-            self._all.append(_Worker(process, here, [], {}, {}))
+            self._all.append(_Worker(process, here, Inbox(here, process), [], {}, {}))
         return len(missing) > 0
 
     def send(self, number: int, agent: str, job: Any) -> None:
@@ -102,7 +104,7 @@ class Workers:
         worker = self._all[number]
         while agent not in worker.arrived:
             try:
-                await_message(worker.connection, worker.process)
+                worker.inbox.wait()
                 whose, result = receive(worker.connection)
             except (EOFError, OSError) as error:
                 raise self._death(number) from error
