@@ -1,4 +1,7 @@
-"""Updates on a GPU against the same on the CPU: eight agents with a belief, one after the other, minibatches of 3,200 rows."""
+"""
+Updates on a GPU against the same on the CPU: eight agents with a belief, one after the other, minibatches of 3,200 rows; and
+gradient steps on the GPU one after the other against stacked ones (benchmarks/stacked.py).
+"""
 
 import statistics
 import time
@@ -7,6 +10,7 @@ from typing import Any
 
 import torch as th
 
+from benchmarks import stacked
 from benchmarks.growth import fill_history
 from benchmarks.measure import spread
 from benchmarks.report import Report
@@ -76,3 +80,6 @@ def run(report: Report, devices: tuple[str, str] = ("cpu", "cuda")) -> None:
         report.time[f"update on {device}"] = {"ms_per_minibatch_of_all_agents": milliseconds}
         print(f"  {device}: {milliseconds:,.1f} ms for one minibatch of each agent")
     report.add_ratio("gpu_vs_cpu_update", spread([cpu / gpu for cpu, gpu in taken]), f"time on {devices[0]} / on {devices[1]}")
+    rows = N_ENVS if report.quick else BATCH_SIZE
+    *_, ratio, _ = stacked.compare(N_AGENTS, rows, report.rounds, devices[1])
+    report.add_ratio("gpu_one_by_one_vs_stacked", ratio, "a gradient step of all agents, one by one / stacked, on the GPU")

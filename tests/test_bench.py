@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch as th
 
-from benchmarks import bench, gpu, heavy
+from benchmarks import bench, gpu, heavy, stacked
 from benchmarks.measure import Sample, alternate, ratio, spread
 from benchmarks.report import BARS, Report
 
@@ -75,8 +75,25 @@ def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
 def test_updates_are_timed_by_themselves():
     report = Report(rounds=1, quick=True)
     gpu.run(report, ("cpu", "cpu"))
+    assert report.ratio_rows["gpu_one_by_one_vs_stacked"]["median"] > 0
     assert report.time["update on cpu"]["ms_per_minibatch_of_all_agents"] > 0
     assert report.ratio_rows["gpu_vs_cpu_update"]["median"] > 0
+
+
+def test_a_stacked_step_is_that_of_each_agent():
+    th.manual_seed(0)
+    policies = [stacked.make_policy("cpu") for _ in range(3)]
+    batches = [stacked.make_batch(16, "cpu") for _ in policies]
+    together, apart = stacked.Stacked(policies, batches), stacked.OneByOne(policies, batches)
+    before = apart.weights()
+    for _ in range(2):
+        together.step()
+        apart.step()
+    found, expected = together.weights(), apart.weights()
+    assert found.keys() == expected.keys()
+    for name, weights in expected.items():
+        th.testing.assert_close(found[name], weights, rtol=0, atol=1e-6)
+        assert (weights - before[name]).abs().amax(dim=tuple(range(1, weights.dim()))).min() > 1e-4
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")

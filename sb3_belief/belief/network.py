@@ -207,6 +207,9 @@ class DynamicBelief(nn.Module):
         The same without keys and values of all rows, which are linear in the states: the query goes to the states by way of
         the keys' weights, and the mean of values is the value of the mean. In one pass these are fewer products where B < T.
         """
+        if kept.shape[1] == 0:
+            # No gradient either: one of zeros would count as a step of Adam's
+            return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
         states = self.observation_embedding(rows.observations) + self.action_embedding(rows.actions)
         queries = self.query(embedding) @ (self.key.weight / math.sqrt(self.embedding_dim))
         mean, weights = attend(queries, states, states, kept)

@@ -29,6 +29,14 @@ def test_more_rows_than_there_are_cannot_be_kept():
         net(th.randn(1, D_O), random_history(2), kept=th.zeros(1, 3, dtype=th.long))
 
 
+@pytest.mark.parametrize("kept", [None, th.zeros(3, 0, dtype=th.int)])
+def test_while_the_history_is_empty_the_attention_is_not_trained(kept):
+    net = DynamicBelief(D_O, W, D, Z)
+    net(th.randn(3, D_O), empty_history(9, D_O, W), kept=kept).prediction.sum().backward()
+    without = {name.split(".")[0] for name, parameter in net.named_parameters() if parameter.grad is None}
+    assert without == {"action_embedding", "query", "key", "value"}
+
+
 @pytest.mark.parametrize("keep_ratio", [0.01, 0.05, 0.5, 1.0])
 def test_at_least_one_row_is_kept_and_at_most_all(keep_ratio):
     for n_rows in range(1, 50):

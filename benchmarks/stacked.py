@@ -1,0 +1,251 @@
+"""
+What would it bring to batch agents of equal shape into one set of stacked kernels? The experiment behind docs/performance.md.
+
+    python -m benchmarks.stacked
+
+One gradient step of PPO with a belief for each of several agents: one agent after the other, as a team does it, and all at
+once, with their weights stacked to ``[agents, out, in]``. The row of a single agent shows what the stacked step saves by
+leaving out what SB3's policies do besides. It prints milliseconds of a step of all agents, medians of rounds in turn, their ratio, and
+the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread, on a GPU, where there
+is one, seconds on the wall.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from torch import nn
+
+from benchmarks.measure import Spread, spread
+from sb3_belief.belief import History, kl_divergence
+from sb3_belief.belief.attention import attend
+from sb3_belief.belief.network import LOG_STD_RANGE
+from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefMinibatch
+
+OBSERVATION, N_ACTIONS, N_OTHERS, HISTORY, KEPT, LATENT = 18, 5, 2, 800, 40, 64
+CLIP, VALUE_COEF, MAX_NORM, LEARNING_RATE = 0.2, 0.5, 0.5, 3e-4
+# Agents and rows of a minibatch: one, which shows what is saved without stacking; those of simple_spread; and many
+SIZES = ((1, 256), (3, 256), (8, 256), (8, 3200))
+
+
+class Batch(NamedTuple):
+    """What one agent's gradient step is made of."""
+
+    observations: th.Tensor
+    actions: th.Tensor
+    old_log_prob: th.Tensor
+    advantages: th.Tensor
+    returns: th.Tensor
+    belief: BeliefMinibatch
+
+
+def make_policy(device: str) -> BeliefActorCriticPolicy:
+    """
+    :param device: of the policy
+    :return: one with a full history
+    """
+    others = {f"other_{i}": spaces.Discrete(N_ACTIONS) for i in range(N_OTHERS)}
+    space = spaces.Box(-10.0, 10.0, (OBSERVATION,))
+    policy = BeliefActorCriticPolicy(space, spaces.Discrete(N_ACTIONS), lambda _: LEARNING_RATE, others_action_spaces=others)
+    policy.to(device)
+    seen = F.one_hot(th.randint(N_ACTIONS, (HISTORY, N_OTHERS)), N_ACTIONS).float().flatten(1)
+    policy.remember(th.randn(HISTORY, OBSERVATION).numpy(), seen.numpy())
+    # With the weights where they are
+    policy.optimizer = th.optim.Adam(policy.parameters(), LEARNING_RATE, eps=1e-5, fused=True)
+    return policy
+
+
+def make_batch(n_rows: int, device: str) -> Batch:
+    """
+    :param n_rows: of the minibatch
+    :param device: of the tensors
+    :return: a minibatch of random numbers
+    """
+    belief = BeliefMinibatch(
+        noise=th.randn(n_rows, LATENT).to(device),
+        kept=th.rand(n_rows, HISTORY).topk(KEPT, dim=1).indices.sort(dim=1).values.int().to(device),
+        others_actions=F.one_hot(th.randint(N_ACTIONS, (n_rows, N_OTHERS)), N_ACTIONS).float().flatten(1).to(device),
+        others_visible=(th.rand(n_rows, N_OTHERS) < 0.5).to(device),
+    )
+    actions = th.randint(N_ACTIONS, (n_rows,)).to(device)
+    old_log_prob = th.full((n_rows,), 1 / N_ACTIONS).log().to(device)
+    advantages, returns = th.randn(2, n_rows).to(device)
+    return Batch(th.randn(n_rows, OBSERVATION).to(device), actions, old_log_prob, advantages, returns, belief)
+
+
+def ppo_loss(log_prob: th.Tensor, values: th.Tensor, batch: Batch) -> th.Tensor:
+    """
+    :param log_prob: of the actions, ``[..., B]``
+    :param values: of the observations, ``[..., B]``
+    :param batch: of one agent, or of all, stacked
+    :return: PPO's loss, the mean over the last dimension
+    """
+    ratio = (log_prob - batch.old_log_prob).exp()
+    clipped = ratio.clamp(1 - CLIP, 1 + CLIP)
+    gain = th.min(batch.advantages * ratio, batch.advantages * clipped)
+    return (VALUE_COEF * (values - batch.returns).square() - gain).mean(dim=-1)
+
+
+class OneByOne:
+    """
+    :param policies: of the agents
+    :param batches: theirs
+    """
+
+    def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
+        self.policies, self.batches = policies, batches
+
+    def step(self) -> None:
+        """One gradient step of each agent."""
+        for policy, batch in zip(self.policies, self.batches, strict=True):
+            policy.stage(batch.belief)
+            values, log_prob, _ = policy.evaluate_actions(batch.observations, batch.actions)
+            loss = ppo_loss(log_prob, values.flatten(), batch)
+            policy.optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(policy.parameters(), MAX_NORM)
+            policy.optimizer.step()
+
+    def weights(self) -> dict[str, th.Tensor]:
+        """
+        :return: all agents' weights by name, ``[agents, ...]``
+        """
+        named = [dict(policy.named_parameters()) for policy in self.policies]
+        return {name: th.stack([weights[name].detach() for weights in named]) for name in named[0]}
+
+
+class Stacked:
+    """
+    The same for all agents at once.
+
+    :param policies: of the agents
+    :param batches: theirs
+    """
+
+    def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
+        stacked = OneByOne(policies, batches).weights()
+        self._weights = {name: weights.clone().requires_grad_() for name, weights in stacked.items()}
+        self._optimizer = th.optim.Adam(self._weights.values(), LEARNING_RATE, eps=1e-5, fused=True)
+        histories = [policy.history for policy in policies]
+        self._history = History(*(th.stack(parts) for parts in zip(*(h for h in histories if h is not None), strict=True)))
+        self._belief = BeliefMinibatch(*map(th.stack, zip(*(batch.belief for batch in batches), strict=True)))
+        tensors = [batch[:-1] for batch in batches]
+        observations, actions, old_log_prob, advantages, returns = map(th.stack, zip(*tensors, strict=True))
+        self._batch = Batch(observations, actions, old_log_prob, advantages, returns, self._belief)
+        # All agents' rows stand below each other in one table
+        first = HISTORY * th.arange(len(policies), dtype=th.int, device=self._belief.kept.device)
+        self._kept = (self._belief.kept + first[:, None, None]).flatten(0, 1)
+
+    def _linear(self, name: str, inputs: th.Tensor) -> th.Tensor:
+        weight, bias = self._weights[f"{name}.weight"].mT, self._weights.get(f"{name}.bias")
+        return inputs @ weight if bias is None else th.baddbmm(bias[:, None], inputs, weight)
+
+    def _believe(self) -> tuple[th.Tensor, th.Tensor]:
+        """Latents ``[agents, B, z]``, and the belief's loss, summed over the agents."""
+        name = "features_extractor.belief"
+
+        def embed(observations: th.Tensor) -> th.Tensor:
+            hidden = self._linear(f"{name}.observation_embedding.0", observations).relu()
+            return self._linear(f"{name}.observation_embedding.2", hidden)
+
+        embedding = embed(self._batch.observations)
+        states = embed(self._history.observations) + self._linear(f"{name}.action_embedding", self._history.actions)
+        queries = self._linear(f"{name}.query", embedding) @ (self._weights[f"{name}.key.weight"] / states.shape[2] ** 0.5)
+        table = states.flatten(0, 1)
+        means, _ = attend(queries.flatten(0, 1), table, table, self._kept)
+        embedding = embedding + self._linear(f"{name}.value", means.view_as(embedding))
+        mean, log_std = self._linear(f"{name}.encoder", embedding).chunk(2, dim=2)
+        log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
+        latent = mean + log_std.exp() * self._belief.noise
+        errors = (self._belief.others_actions - self._linear(f"{name}.decoder", latent)).square()
+        visible = self._belief.others_visible
+        seen = (errors.unflatten(2, (-1, N_ACTIONS)).sum(dim=3) * visible).sum(dim=(1, 2)) / visible.sum(dim=(1, 2)).clamp(
+            min=1
+        )
+        divergences = sum(kl_divergence(*own) for own in zip(mean, log_std, strict=True))
+        return latent, 0.5 * seen.sum() + 0.005 * divergences
+
+    def step(self) -> None:
+        """One gradient step of each agent."""
+        latent, belief_loss = self._believe()
+        codes = []
+        for head, fusion in (("policy_net", "fuse_pi"), ("value_net", "fuse_vf")):
+            code = self._linear(f"mlp_extractor.base.{head}.0", self._batch.observations).tanh()
+            code = self._linear(f"mlp_extractor.base.{head}.2", code).tanh()
+            codes.append(self._linear(f"mlp_extractor.{fusion}", th.cat([code, latent], dim=2)).relu())
+        log_probs = self._linear("action_net", codes[0]).log_softmax(dim=2)
+        log_prob = log_probs.gather(2, self._batch.actions[:, :, None]).squeeze(2)
+        loss = ppo_loss(log_prob, self._linear("value_net", codes[1]).squeeze(2), self._batch).sum()
+        self._optimizer.zero_grad()
+        (loss + belief_loss).backward()
+        self._clip()
+        self._optimizer.step()
+
+    def _clip(self) -> None:
+        """The norm of each agent's gradient, at most ``MAX_NORM``."""
+        gradients = [weights.grad for weights in self._weights.values() if weights.grad is not None]
+        norms = th.stack([gradient.flatten(1).norm(dim=1) for gradient in gradients]).norm(dim=0)
+        factors = (MAX_NORM / (norms + 1e-6)).clamp(max=1)
+        for gradient in gradients:
+            gradient.mul_(factors.view(-1, *[1] * (gradient.dim() - 1)))
+
+    def weights(self) -> dict[str, th.Tensor]:
+        """
+        :return: all agents' weights by name, ``[agents, ...]``
+        """
+        return {name: weights.detach() for name, weights in self._weights.items()}
+
+
+def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> tuple[Spread, Spread, Spread, float]:
+    """
+    :param n_agents: each with a belief about two others
+    :param n_rows: of a minibatch
+    :param rounds: measurements of each way
+    :param device: where
+    :return: seconds one by one, seconds stacked, their ratio, and the largest difference of a weight after the first step
+    """
+    th.manual_seed(0)
+    policies = [make_policy(device) for _ in range(n_agents)]
+    batches = [make_batch(n_rows, device) for _ in range(n_agents)]
+    stacked, one_by_one = Stacked(policies, batches), OneByOne(policies, batches)
+    stacked.step()
+    one_by_one.step()
+    found, expected = stacked.weights(), one_by_one.weights()
+    difference = max(float((found[name] - expected[name]).abs().max()) for name in expected)
+    taken = [(_seconds(one_by_one.step, device), _seconds(stacked.step, device)) for _ in range(rounds)]
+    apart, together = zip(*taken, strict=True)
+    return spread(apart), spread(together), spread([a / b for a, b in taken]), difference
+
+
+def _seconds(step: Callable[[], None], device: str, steps: int = 3) -> float:
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    start = clock()
+    for _ in range(steps):
+        step()
+    if device != "cpu":
+        th.cuda.synchronize()
+    return (clock() - start) / steps
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    print(f"{'device':>6} {'agents':>6} {'rows':>6} {'one by one':>12} {'stacked':>12}   one by one / stacked   difference")
+    for device in ("cpu", "cuda"):
+        if device == "cuda" and not th.cuda.is_available():
+            print("  cuda skipped: torch finds no GPU")
+            continue
+        for n_agents, n_rows in SIZES:
+            apart, together, ratio, difference = compare(n_agents, n_rows, args.rounds, device)
+            row = f"{device:>6} {n_agents:>6} {n_rows:>6,} {1000 * apart.median:>9.1f} ms {1000 * together.median:>9.1f} ms"
+            print(f"{row}   {ratio.median:.2f} ({ratio.low:.2f} to {ratio.high:.2f})    {difference:.0e}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
