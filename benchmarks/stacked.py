@@ -5,9 +5,9 @@ What would it bring to batch agents of equal shape into one set of stacked kerne
 
 One gradient step of PPO with a belief for each of several agents: one agent after the other, as a team does it, and all at
 once, with their weights stacked to ``[agents, out, in]``. The row of a single agent shows what the stacked step saves by
-leaving out what SB3's policies do besides. It prints milliseconds of a step of all agents, medians of rounds in turn, their ratio, and
-the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread, on a GPU, where there
-is one, seconds on the wall.
+leaving out what SB3's policies do besides. It prints milliseconds of a step of all agents, medians of rounds in turn, their
+ratio, and the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread, on a
+GPU, where there is one, seconds on the wall.
 """
 
 import argparse

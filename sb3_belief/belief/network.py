@@ -102,7 +102,7 @@ class DynamicBelief(nn.Module):
         self.variant = VARIANTS[variant]
         self.similarity = similarity
         self.observation_embedding = nn.Sequential(
-            nn.Linear(observation_dim, embedding_dim), nn.ReLU(), nn.Linear(embedding_dim, embedding_dim)
+            nn.Linear(observation_dim, embedding_dim), nn.ReLU(inplace=True), nn.Linear(embedding_dim, embedding_dim)
         )
         if self.variant.attends:
             self.action_embedding = nn.Linear(action_dim, embedding_dim)
