@@ -38,12 +38,18 @@ def attend(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tens
     :param kept: The rows that each query attends to, in ascending order and none twice, int32 ``[B, N]``
     :return: The weighted means ``[B, v]``, zero where N is 0, and the weights ``[B, N]``, which are to be looked at: no
         gradient flows from them
-    :raises ValueError: if more rows are to be kept than there are
+    :raises ValueError: if more rows are to be kept than there are, or others
     """
     if kept.shape[1] > len(keys):
         raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(keys)}; keep at most as many")
-    if kept.shape[1] == 0:
+    if kept.numel() == 0:
         return queries.new_zeros(len(queries), values.shape[1]), queries.new_zeros(kept.shape)
+    first, last = (int(row) for row in kept.aminmax())
+    if first < 0 or last >= len(keys):
+        raise ValueError(
+            f"rows {first} to {last} are to be kept of a history of {len(keys)}; keep rows that it has, selected from "
+            "the history as it is now"
+        )
     if th.is_grad_enabled():
         return _Attend.apply(queries, keys, values, kept)
     # For the few queries of a rollout a product with all keys is quicker than naming the wanted ones

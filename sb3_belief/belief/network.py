@@ -204,8 +204,11 @@ class DynamicBelief(nn.Module):
 
     def _attend_to_states(self, embedding: th.Tensor, rows: History, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        The same without keys and values of all rows, which are linear in the states: the query goes to the states by way of
-        the keys' weights, and the mean of values is the value of the mean. In one pass these are fewer products where B < T.
+        Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
+        names no softmax; "scaled" is read as in the transformer, by the root of the width.
+
+        Without keys and values of all rows, since both are linear in the states: the query goes to the states by way of the
+        keys' weights, and the mean of values is the value of the mean. In a single pass these are fewer products where B < T.
         """
         if kept.shape[1] == 0:
             # No gradient either: one of zeros would count as a step of Adam's

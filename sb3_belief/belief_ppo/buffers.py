@@ -160,7 +160,7 @@ class BeliefBufferMixin(_Buffer):
     def belief_minibatch(self, rows: Any) -> BeliefMinibatch:
         """
         :param rows: Index into the rows as they are ordered at present
-        :return: The belief's part of these rows, on the buffer's device
+        :return: The belief's part of these rows, on the buffer's device; for a slice it is a part of the buffer itself
         """
         parts = self.noise[rows], self.kept[rows][..., : self._n_kept], self.others_actions[rows], self.others_visible[rows]
         return BeliefMinibatch(*(th.as_tensor(np.ascontiguousarray(part), device=self.device) for part in parts))

@@ -79,6 +79,13 @@ def test_without_gradients_the_result_is_the_same():
         th.testing.assert_close(attend(queries, keys, values, kept), recorded)
 
 
+@pytest.mark.parametrize("kept", [[[0, 3]], [[-1, 0]]])
+def test_rows_that_there_are_not_cannot_be_kept(kept):
+    rows = th.randn(3, 2, requires_grad=True)
+    with pytest.raises(ValueError, match=r"rows (0 to 3|-1 to 0) are to be kept of a history of 3"):
+        attend(th.randn(1, 2), rows, rows, th.tensor(kept, dtype=th.int))
+
+
 def test_a_row_that_nobody_keeps_gets_no_gradient():
     keys, values = (th.randn(5, 3, requires_grad=True) for _ in range(2))
     attend(th.randn(2, 3), keys, values, th.tensor([[0, 1], [1, 3]]))[0].sum().backward()
