@@ -81,5 +81,8 @@ def run(report: Report, devices: tuple[str, str] = ("cpu", "cuda")) -> None:
         print(f"  {device}: {milliseconds:,.1f} ms for one minibatch of each agent")
     report.add_ratio("gpu_vs_cpu_update", spread([cpu / gpu for cpu, gpu in taken]), f"time on {devices[0]} / on {devices[1]}")
     rows = N_ENVS if report.quick else BATCH_SIZE
-    *_, ratio, _ = stacked.compare(N_AGENTS, rows, report.rounds, devices[1])
-    report.add_ratio("gpu_one_by_one_vs_stacked", ratio, "a gradient step of all agents, one by one / stacked, on the GPU")
+    gains = stacked.compare(N_AGENTS, rows, report.rounds, devices[1]).gains
+    for way in ("lockstep", "stacked"):
+        report.add_ratio(
+            f"gpu_one_by_one_vs_{way}", gains[way], f"a gradient step of all agents on the GPU, one by one / {way}"
+        )

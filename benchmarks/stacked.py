@@ -3,11 +3,14 @@ What would it bring to batch agents of equal shape into one set of stacked kerne
 
     python -m benchmarks.stacked
 
-One gradient step of PPO with a belief for each of several agents: one agent after the other, as a team does it, and all at
-once, with their weights stacked to ``[agents, out, in]``. The row of a single agent shows what the stacked step saves by
-leaving out what SB3's policies do besides. It prints milliseconds of a step of all agents, medians of rounds in turn, their
-ratio, and the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread, on a
-GPU, where there is one, seconds on the wall.
+One gradient step of PPO with a belief for each of several agents: one agent after the other, as a team does it; all at once,
+with their weights stacked to ``[agents, out, in]``; and in lockstep, where only the passes forward and backward are stacked,
+and each agent has its own loss, clipping and optimiser, as SB3 would have it. The row of a single agent shows what is saved
+by leaving out what SB3's policies do besides.
+
+It prints milliseconds of a step of all agents, medians of rounds in turn, how many times as long one by one takes (quartiles
+in brackets), and the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread,
+on a GPU, where there is one, seconds on the wall.
 """
 
 import argparse
@@ -169,8 +172,10 @@ class Stacked:
         divergences = sum(kl_divergence(*own) for own in zip(mean, log_std, strict=True))
         return latent, 0.5 * seen.sum() + 0.005 * divergences
 
-    def step(self) -> None:
-        """One gradient step of each agent."""
+    def passes(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        :return: values and log probabilities of the actions, each ``[agents, B]``, and the beliefs' loss, summed over agents
+        """
         latent, belief_loss = self._believe()
         codes = []
         for head, fusion in (("policy_net", "fuse_pi"), ("value_net", "fuse_vf")):
@@ -179,9 +184,13 @@ class Stacked:
             codes.append(self._linear(f"mlp_extractor.{fusion}", th.cat([code, latent], dim=2)).relu())
         log_probs = self._linear("action_net", codes[0]).log_softmax(dim=2)
         log_prob = log_probs.gather(2, self._batch.actions[:, :, None]).squeeze(2)
-        loss = ppo_loss(log_prob, self._linear("value_net", codes[1]).squeeze(2), self._batch).sum()
+        return self._linear("value_net", codes[1]).squeeze(2), log_prob, belief_loss
+
+    def step(self) -> None:
+        """One gradient step of each agent."""
+        values, log_prob, belief_loss = self.passes()
         self._optimizer.zero_grad()
-        (loss + belief_loss).backward()
+        (ppo_loss(log_prob, values, self._batch).sum() + belief_loss).backward()
         self._clip()
         self._optimizer.step()
 
@@ -200,25 +209,80 @@ class Stacked:
         return {name: weights.detach() for name, weights in self._weights.items()}
 
 
-def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> tuple[Spread, Spread, Spread, float]:
+class InLockstep(Stacked):
+    """
+    Only the passes forward and backward for all agents at once. Each agent has a loss, a clipping and an optimiser of its own,
+    as its own ``train()`` would have them.
+
+    :param policies: of the agents
+    :param batches: theirs
+    """
+
+    def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
+        super().__init__(policies, batches)
+        self._batches = batches
+        # Slices of the stacked weights, in the same memory
+        self._own = [[w.detach()[i].requires_grad_() for w in self._weights.values()] for i in range(len(policies))]
+        self._optimizers = [th.optim.Adam(own, LEARNING_RATE, eps=1e-5, fused=True) for own in self._own]
+
+    def step(self) -> None:
+        """One gradient step of each agent."""
+        values, log_prob, belief_loss = self.passes()
+        gradients = []
+        for i, batch in enumerate(self._batches):
+            own = values.detach()[i].requires_grad_(), log_prob.detach()[i].requires_grad_()
+            ppo_loss(own[1], own[0], batch).backward()
+            gradients.append([part.grad for part in own])
+        for weights in self._weights.values():
+            weights.grad = None
+        upstream = [th.stack(parts) for parts in zip(*gradients, strict=True)]
+        th.autograd.backward([values, log_prob, belief_loss], [*upstream, th.ones_like(belief_loss)])
+        for i, (own_weights, optimizer) in enumerate(zip(self._own, self._optimizers, strict=True)):
+            for slice_, weights in zip(own_weights, self._weights.values(), strict=True):
+                assert weights.grad is not None
+                slice_.grad = weights.grad[i]
+            nn.utils.clip_grad_norm_(own_weights, MAX_NORM)
+            optimizer.step()
+
+
+WAYS: dict[str, type[OneByOne] | type[Stacked]] = {"one by one": OneByOne, "lockstep": InLockstep, "stacked": Stacked}
+
+
+class Comparison(NamedTuple):
+    """
+    :param seconds: of a step of all agents, by way
+    :param gains: time one by one over that, by way
+    :param difference: the largest of any weight to those one by one, after the first step
+    """
+
+    seconds: dict[str, Spread]
+    gains: dict[str, Spread]
+    difference: float
+
+
+def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> Comparison:
     """
     :param n_agents: each with a belief about two others
     :param n_rows: of a minibatch
     :param rounds: measurements of each way
     :param device: where
-    :return: seconds one by one, seconds stacked, their ratio, and the largest difference of a weight after the first step
+    :return: what was found
     """
     th.manual_seed(0)
     policies = [make_policy(device) for _ in range(n_agents)]
     batches = [make_batch(n_rows, device) for _ in range(n_agents)]
-    stacked, one_by_one = Stacked(policies, batches), OneByOne(policies, batches)
-    stacked.step()
-    one_by_one.step()
-    found, expected = stacked.weights(), one_by_one.weights()
-    difference = max(float((found[name] - expected[name]).abs().max()) for name in expected)
-    taken = [(_seconds(one_by_one.step, device), _seconds(stacked.step, device)) for _ in range(rounds)]
-    apart, together = zip(*taken, strict=True)
-    return spread(apart), spread(together), spread([a / b for a, b in taken]), difference
+    # Those that copy the weights before the one that trains the policies themselves
+    ways = {name: WAYS[name](policies, batches) for name in reversed(WAYS)}
+    for way in ways.values():
+        way.step()
+    expected = ways["one by one"].weights()
+    differences = [(way.weights()[name] - weights).abs().max() for way in ways.values() for name, weights in expected.items()]
+    rows = [{name: _seconds(ways[name].step, device) for name in WAYS} for _ in range(rounds)]
+    return Comparison(
+        {name: spread([row[name] for row in rows]) for name in WAYS},
+        {name: spread([row["one by one"] / row[name] for row in rows]) for name in WAYS},
+        float(max(differences)),
+    )
 
 
 def _seconds(step: Callable[[], None], device: str, steps: int = 3) -> float:
@@ -236,15 +300,22 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     args = parser.parse_args()
     th.set_num_threads(1)
-    print(f"{'device':>6} {'agents':>6} {'rows':>6} {'one by one':>12} {'stacked':>12}   one by one / stacked   difference")
+    columns = "".join(f"{name:>30}" for name in WAYS)
+    print(f"{'device':>6} {'agents':>6} {'rows':>6}{columns}   difference")
     for device in ("cpu", "cuda"):
         if device == "cuda" and not th.cuda.is_available():
             print("  cuda skipped: torch finds no GPU")
             continue
         for n_agents, n_rows in SIZES:
-            apart, together, ratio, difference = compare(n_agents, n_rows, args.rounds, device)
-            row = f"{device:>6} {n_agents:>6} {n_rows:>6,} {1000 * apart.median:>9.1f} ms {1000 * together.median:>9.1f} ms"
-            print(f"{row}   {ratio.median:.2f} ({ratio.low:.2f} to {ratio.high:.2f})    {difference:.0e}", flush=True)
+            seconds, gains, difference = compare(n_agents, n_rows, args.rounds, device)
+            texts = [f"{1000 * seconds[name].median:.1f} ms, {_text(gains[name])}" for name in WAYS]
+            print(
+                f"{device:>6} {n_agents:>6} {n_rows:>6,}" + "".join(f"{text:>30}" for text in texts) + f"   {difference:.0e}"
+            )
+
+
+def _text(gain: Spread) -> str:
+    return f"{gain.median:.2f} [{gain.low:.2f}, {gain.high:.2f}]"
 
 
 if __name__ == "__main__":

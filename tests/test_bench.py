@@ -75,16 +75,18 @@ def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
 def test_updates_are_timed_by_themselves():
     report = Report(rounds=1, quick=True)
     gpu.run(report, ("cpu", "cpu"))
-    assert report.ratio_rows["gpu_one_by_one_vs_stacked"]["median"] > 0
+    for way in ("lockstep", "stacked"):
+        assert report.ratio_rows[f"gpu_one_by_one_vs_{way}"]["median"] > 0
     assert report.time["update on cpu"]["ms_per_minibatch_of_all_agents"] > 0
     assert report.ratio_rows["gpu_vs_cpu_update"]["median"] > 0
 
 
-def test_a_stacked_step_is_that_of_each_agent():
+@pytest.mark.parametrize("way", [stacked.Stacked, stacked.InLockstep])
+def test_a_stacked_step_is_that_of_each_agent(way):
     th.manual_seed(0)
     policies = [stacked.make_policy("cpu") for _ in range(3)]
     batches = [stacked.make_batch(16, "cpu") for _ in policies]
-    together, apart = stacked.Stacked(policies, batches), stacked.OneByOne(policies, batches)
+    together, apart = way(policies, batches), stacked.OneByOne(policies, batches)
     before = apart.weights()
     for _ in range(2):
         together.step()
