@@ -14,7 +14,6 @@ on a GPU, where there is one, seconds on the wall.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from benchmarks.measure import Spread, spread
+from benchmarks.measure import Loop, Spread, alternate, ratio, speeds, spread
 from sb3_belief.belief import History, kl_divergence
 from sb3_belief.belief.attention import attend
 from sb3_belief.belief.network import LOG_STD_RANGE
@@ -121,9 +120,9 @@ class OneByOne:
         return {name: th.stack([weights[name].detach() for weights in named]) for name in named[0]}
 
 
-class Stacked:
+class StackedPasses:
     """
-    The same for all agents at once.
+    Weights, histories and minibatches of all agents, stacked, and the passes forward of all at once.
 
     :param policies: of the agents
     :param batches: theirs
@@ -132,16 +131,16 @@ class Stacked:
     def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
         stacked = OneByOne(policies, batches).weights()
         self._weights = {name: weights.clone().requires_grad_() for name, weights in stacked.items()}
-        self._optimizer = th.optim.Adam(self._weights.values(), LEARNING_RATE, eps=1e-5, fused=True)
+        self._action_coef, self._kl_coef = policies[0].action_coef, policies[0].kl_coef
         histories = [policy.history for policy in policies]
         self._history = History(*(th.stack(parts) for parts in zip(*(h for h in histories if h is not None), strict=True)))
-        self._belief = BeliefMinibatch(*map(th.stack, zip(*(batch.belief for batch in batches), strict=True)))
+        belief = BeliefMinibatch(*map(th.stack, zip(*(batch.belief for batch in batches), strict=True)))
         tensors = [batch[:-1] for batch in batches]
         observations, actions, old_log_prob, advantages, returns = map(th.stack, zip(*tensors, strict=True))
-        self._batch = Batch(observations, actions, old_log_prob, advantages, returns, self._belief)
+        self._batch = Batch(observations, actions, old_log_prob, advantages, returns, belief)
         # All agents' rows stand below each other in one table
-        first = HISTORY * th.arange(len(policies), dtype=th.int, device=self._belief.kept.device)
-        self._kept = (self._belief.kept + first[:, None, None]).flatten(0, 1)
+        first = HISTORY * th.arange(len(policies), dtype=th.int, device=belief.kept.device)
+        self._kept = (belief.kept + first[:, None, None]).flatten(0, 1)
 
     def _linear(self, name: str, inputs: th.Tensor) -> th.Tensor:
         weight, bias = self._weights[f"{name}.weight"].mT, self._weights.get(f"{name}.bias")
@@ -163,14 +162,13 @@ class Stacked:
         embedding = embedding + self._linear(f"{name}.value", means.view_as(embedding))
         mean, log_std = self._linear(f"{name}.encoder", embedding).chunk(2, dim=2)
         log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
-        latent = mean + log_std.exp() * self._belief.noise
-        errors = (self._belief.others_actions - self._linear(f"{name}.decoder", latent)).square()
-        visible = self._belief.others_visible
-        seen = (errors.unflatten(2, (-1, N_ACTIONS)).sum(dim=3) * visible).sum(dim=(1, 2)) / visible.sum(dim=(1, 2)).clamp(
-            min=1
-        )
+        latent = mean + log_std.exp() * self._batch.belief.noise
+        errors = (self._batch.belief.others_actions - self._linear(f"{name}.decoder", latent)).square()
+        visible = self._batch.belief.others_visible
+        n_visible = visible.sum(dim=(1, 2)).clamp(min=1)
+        seen = (errors.unflatten(2, (-1, N_ACTIONS)).sum(dim=3) * visible).sum(dim=(1, 2)) / n_visible
         divergences = sum(kl_divergence(*own) for own in zip(mean, log_std, strict=True))
-        return latent, 0.5 * seen.sum() + 0.005 * divergences
+        return latent, self._action_coef * seen.sum() + self._kl_coef * divergences
 
     def passes(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
@@ -185,6 +183,25 @@ class Stacked:
         log_probs = self._linear("action_net", codes[0]).log_softmax(dim=2)
         log_prob = log_probs.gather(2, self._batch.actions[:, :, None]).squeeze(2)
         return self._linear("value_net", codes[1]).squeeze(2), log_prob, belief_loss
+
+    def weights(self) -> dict[str, th.Tensor]:
+        """
+        :return: all agents' weights by name, ``[agents, ...]``
+        """
+        return {name: weights.detach() for name, weights in self._weights.items()}
+
+
+class Stacked(StackedPasses):
+    """
+    All of the step for all agents at once: loss, clipping and optimiser, too.
+
+    :param policies: of the agents
+    :param batches: theirs
+    """
+
+    def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
+        super().__init__(policies, batches)
+        self._optimizer = th.optim.Adam(self._weights.values(), LEARNING_RATE, eps=1e-5, fused=True)
 
     def step(self) -> None:
         """One gradient step of each agent."""
@@ -202,14 +219,8 @@ class Stacked:
         for gradient in gradients:
             gradient.mul_(factors.view(-1, *[1] * (gradient.dim() - 1)))
 
-    def weights(self) -> dict[str, th.Tensor]:
-        """
-        :return: all agents' weights by name, ``[agents, ...]``
-        """
-        return {name: weights.detach() for name, weights in self._weights.items()}
 
-
-class InLockstep(Stacked):
+class InLockstep(StackedPasses):
     """
     Only the passes forward and backward for all agents at once. Each agent has a loss, a clipping and an optimiser of its own,
     as its own ``train()`` would have them.
@@ -245,7 +256,11 @@ class InLockstep(Stacked):
             optimizer.step()
 
 
-WAYS: dict[str, type[OneByOne] | type[Stacked]] = {"one by one": OneByOne, "lockstep": InLockstep, "stacked": Stacked}
+WAYS: dict[str, type[OneByOne] | type[Stacked] | type[InLockstep]] = {
+    "one by one": OneByOne,
+    "lockstep": InLockstep,
+    "stacked": Stacked,
+}
 
 
 class Comparison(NamedTuple):
@@ -277,22 +292,24 @@ def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> Com
         way.step()
     expected = ways["one by one"].weights()
     differences = [(way.weights()[name] - weights).abs().max() for way in ways.values() for name, weights in expected.items()]
-    rows = [{name: _seconds(ways[name].step, device) for name in WAYS} for _ in range(rounds)]
+    samples = alternate({name: _loop(way.step, device) for name, way in ways.items()}, rounds)
+    clock = "cpu" if device == "cpu" else "wall"
     return Comparison(
-        {name: spread([row[name] for row in rows]) for name in WAYS},
-        {name: spread([row["one by one"] / row[name] for row in rows]) for name in WAYS},
+        {name: spread([1 / speed for speed in speeds(samples[name], clock)]) for name in WAYS},
+        {name: ratio(samples[name], samples["one by one"], clock) for name in WAYS},
         float(max(differences)),
     )
 
 
-def _seconds(step: Callable[[], None], device: str, steps: int = 3) -> float:
-    clock = time.process_time if device == "cpu" else time.perf_counter
-    start = clock()
-    for _ in range(steps):
-        step()
-    if device != "cpu":
-        th.cuda.synchronize()
-    return (clock() - start) / steps
+def _loop(step: Callable[[], None], device: str, steps: int = 3) -> Loop:
+    def loop() -> int:
+        for _ in range(steps):
+            step()
+        if device != "cpu":
+            th.cuda.synchronize()
+        return steps
+
+    return loop
 
 
 def main() -> None:

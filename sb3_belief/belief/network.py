@@ -165,12 +165,15 @@ class DynamicBelief(nn.Module):
         """
         embedding = self.observation_embedding(observations)
         if self.variant.attends:
-            if context is None and history is None:
-                raise ValueError("this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)")
-            if context is None and kept is not None:
-                summary, weights = self._attend_to_states(embedding, history.filled(), kept)  # type: ignore[union-attr]
+            if context is None and history is not None and kept is not None:
+                summary, weights = self._attend_to_states(embedding, history.filled(), kept)
             else:
-                context = context or self.encode_history(history)  # type: ignore[arg-type]
+                if context is None:
+                    if history is None:
+                        raise ValueError(
+                            "this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)"
+                        )
+                    context = self.encode_history(history)
                 kept = self._most_similar(observations, embedding, context) if kept is None else kept
                 summary, weights = attend(self.query(embedding), context.keys, context.values, kept)
             embedding = embedding + summary

@@ -163,7 +163,7 @@ class BeliefBufferMixin(_Buffer):
         :return: The belief's part of these rows, on the buffer's device; for a slice it is a part of the buffer itself
         """
         parts = self.noise[rows], self.kept[rows][..., : self._n_kept], self.others_actions[rows], self.others_visible[rows]
-        return BeliefMinibatch(*(th.as_tensor(np.ascontiguousarray(part), device=self.device) for part in parts))
+        return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 
 class BeliefRolloutBuffer(BeliefBufferMixin, RolloutBuffer):
