@@ -16,21 +16,23 @@ with warnings.catch_warnings():
 
 def largest(values: th.Tensor, n: int) -> th.Tensor:
     """
-    :param values: ``[B, T]``, no gradient flows from them
+    :param values: ``[..., T]``, no gradient flows from them
     :param n: How many are wanted, at most T
-    :return: Where the largest values of each row stand, in ascending order, int32 ``[B, n]``
+    :return: Where the largest values of each row stand, in ascending order, int32 ``[..., n]``
     """
     if n == 0 or values.device.type != "cpu":
-        return values.topk(n, dim=1, sorted=False).indices.int().sort(dim=1).values
+        return values.topk(n, dim=-1, sorted=False).indices.int().sort(dim=-1).values
     # A third of the time of topk()
-    columns = np.argpartition(values.detach().numpy(), -n, axis=1)[:, -n:].astype(np.int32)
-    columns.sort(axis=1)
+    columns = np.argpartition(values.detach().numpy(), -n, axis=-1)[..., -n:].astype(np.int32)
+    columns.sort(axis=-1)
     return th.from_numpy(columns)
 
 
 def attend(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
     Each query's mean of the values of its kept rows, weighted by a softmax over its products with their keys.
+
+    Several agents' can be computed at once, stacked along a first dimension of all arguments.
 
     :param queries: ``[B, d]``
     :param keys: ``[T, d]``
@@ -40,21 +42,27 @@ def attend(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tens
         gradient flows from them
     :raises ValueError: if more rows are to be kept than there are, or others
     """
-    if kept.shape[1] > len(keys):
-        raise ValueError(f"{kept.shape[1]} rows are to be kept of a history of {len(keys)}; keep at most as many")
+    n_rows = keys.shape[-2]
+    if kept.shape[-1] > n_rows:
+        raise ValueError(f"{kept.shape[-1]} rows are to be kept of a history of {n_rows}; keep at most as many")
     if kept.numel() == 0:
-        return queries.new_zeros(len(queries), values.shape[1]), queries.new_zeros(kept.shape)
+        return queries.new_zeros(*queries.shape[:-1], values.shape[-1]), queries.new_zeros(kept.shape)
     first, last = (int(row) for row in kept.aminmax())
-    if first < 0 or last >= len(keys):
+    if first < 0 or last >= n_rows:
         raise ValueError(
-            f"rows {first} to {last} are to be kept of a history of {len(keys)}; keep rows that it has, selected from "
+            f"rows {first} to {last} are to be kept of a history of {n_rows}; keep rows that it has, selected from "
             "the history as it is now"
         )
+    # Several agents' rows stand below each other in one table
+    in_table = kept if kept.dim() == 2 else kept + n_rows * th.arange(len(kept), device=kept.device).int()[:, None, None]
+    flat_values, in_table = values.flatten(0, -2), in_table.flatten(0, -2)
     if th.is_grad_enabled():
-        return _Attend.apply(queries, keys, values, kept)
-    # For the few queries of a rollout a product with all keys is quicker than naming the wanted ones
-    weights = (queries @ keys.T).gather(1, kept.long()).softmax(dim=1)
-    return _sums(values, kept, weights), weights
+        means, weights = _Attend.apply(queries.flatten(0, -2), keys.flatten(0, -2), flat_values, in_table)
+    else:
+        # For the few queries of a rollout a product with all keys is quicker than naming the wanted ones
+        weights = (queries @ keys.mT).gather(-1, kept.long()).softmax(dim=-1)
+        means = _sums(flat_values, in_table, weights.flatten(0, -2))
+    return means.view(*queries.shape[:-1], -1), weights.view(kept.shape)
 
 
 class _Attend(th.autograd.Function):
@@ -68,7 +76,7 @@ class _Attend(th.autograd.Function):
     def forward(
         ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        weights = _products(queries, keys, kept).softmax(dim=1)
+        weights = _products(queries, keys, kept).softmax(dim=-1)
         ctx.save_for_backward(queries, keys, values, kept, weights)
         ctx.mark_non_differentiable(weights)
         return _sums(values, kept, weights), weights

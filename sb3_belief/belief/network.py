@@ -139,7 +139,7 @@ class DynamicBelief(nn.Module):
         rows = history.filled()
         embeddings = self.observation_embedding(rows.observations)
         states = embeddings + self.action_embedding(rows.actions)
-        directions = F.normalize(self._compared(rows.observations, embeddings), dim=1)
+        directions = F.normalize(self._compared(rows.observations, embeddings), dim=-1)
         return HistoryContext(directions, self.key(states) / math.sqrt(self.embedding_dim), self.value(states))
 
     def forward(
@@ -178,11 +178,11 @@ class DynamicBelief(nn.Module):
                 summary, weights = attend(self.query(embedding), context.keys, context.values, kept)
             embedding = embedding + summary
         else:
-            kept = th.zeros(len(observations), 0, dtype=th.int, device=observations.device)
+            kept = th.zeros(*observations.shape[:-1], 0, dtype=th.int, device=observations.device)
             weights = embedding.new_zeros(kept.shape)
         encoded = self.encoder(embedding)
         if self.variant.samples:
-            mean, log_std = encoded.chunk(2, dim=1)
+            mean, log_std = encoded.chunk(2, dim=-1)
             # clamp(), whose backward pass takes four times as long
             log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
             latent = mean if noise is None else mean + log_std.exp() * noise
@@ -202,8 +202,8 @@ class DynamicBelief(nn.Module):
         is discrete, so no gradient flows through it.
         """
         # The length of the present one changes nothing in the order, so only the rows' directions are needed
-        similarity = self._compared(observations, embeddings) @ context.directions.T
-        return largest(similarity, n_kept(self.keep_ratio, similarity.shape[1]))
+        similarity = self._compared(observations, embeddings) @ context.directions.mT
+        return largest(similarity, n_kept(self.keep_ratio, similarity.shape[-1]))
 
     def _attend_to_states(self, embedding: th.Tensor, rows: History, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -213,7 +213,7 @@ class DynamicBelief(nn.Module):
         Without keys and values of all rows, since both are linear in the states: the query goes to the states by way of the
         keys' weights, and the mean of values is the value of the mean. In a single pass these are fewer products where B < T.
         """
-        if kept.shape[1] == 0:
+        if kept.shape[-1] == 0:
             # No gradient either: one of zeros would count as a step of Adam's
             return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
         states = self.observation_embedding(rows.observations) + self.action_embedding(rows.actions)

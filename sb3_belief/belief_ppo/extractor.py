@@ -13,6 +13,7 @@ from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
 from sb3_belief.belief_ppo.options import BeliefOptions
+from sb3_belief.belief_ppo.writes import Watch
 
 
 def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
@@ -48,7 +49,7 @@ class Passing:
     :param noise: The noise it drew
     :param acted_with: Noise and history rows of the last pass that chose actions, see :meth:`BeliefPolicyMixin.acted_with`
     :param context: The encoded history
-    :param context_of: The state of weights and history that it was made from
+    :param context_of: The weights and history that it was made from
     """
 
     given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
@@ -56,7 +57,7 @@ class Passing:
     noise: th.Tensor | None = None
     acted_with: tuple[th.Tensor, th.Tensor] | None = None
     context: HistoryContext | None = None
-    context_of: list[tuple[int, int]] = field(default_factory=list)
+    context_of: Watch = field(default_factory=Watch)
 
 
 class BeliefExtractor(BaseFeaturesExtractor):
@@ -133,16 +134,29 @@ class BeliefExtractor(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor | TensorDict) -> BeliefFeatures:
         noise, kept, sample = self.passing.given
         flat = flatten_observation(observations)
-        if sample and self.belief.variant.samples:
-            noise = th.randn(len(flat), self.belief.latent_dim, device=flat.device)
+        if sample:
+            noise = self.draw_noise(flat)
         # Whoever acts asks for no prediction
         output = self.infer(flat, noise, kept, predict=th.is_grad_enabled())
         self.passing.output, self.passing.noise = output, noise
+        return self.beside(self.features(observations), output)
+
+    def draw_noise(self, flat: th.Tensor) -> th.Tensor | None:
+        """
+        :param flat: Preprocessed flat observations, ``[B, d_o]``
+        :return: Noise for the beliefs about them, ``[B, z]``; None for a belief that does not sample
+        """
+        return th.randn(len(flat), self.belief.latent_dim, device=flat.device) if self.belief.variant.samples else None
+
+    def beside(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures:
+        """
+        :param own: Features of the observation
+        :param output: The belief about it
+        :return: Both, as the options want the belief
+        """
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
-        if self.options.detach_belief:
-            latent = latent.detach()
-        return BeliefFeatures(self.features(observations), latent)
+        return BeliefFeatures(own, latent.detach() if self.options.detach_belief else latent)
 
     def infer(
         self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None, predict: bool = True
@@ -155,21 +169,20 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :return: The belief, from the present history
         """
         history = self.history
-        context = None if history is None or th.is_grad_enabled() else self._cached_context(history)
+        context = None if history is None or th.is_grad_enabled() else self.encoded(history)
         return self.belief(flat, history, noise, kept, context, predict)
 
-    def _cached_context(self, history: History) -> HistoryContext:
+    def encoded(self, history: History) -> HistoryContext:
         """
-        Between two updates neither weights nor history change, so the encoded history is kept. Whether they did is told by
-        PyTorch's version counters, which every optimiser step and every load moves: no caller has to think of it.
+        Between two updates neither weights nor history change, so the encoded history is kept.
+
+        :param history: The present one
+        :return: The same as the network sees it, without gradients
         """
-        tensors = [*self.belief.context_parameters(), *history]
-        state = [(tensor.data_ptr(), tensor._version) for tensor in tensors]
-        context, passing = self.passing.context, self.passing
-        if context is None or passing.context_of != state:
-            context = passing.context = self.belief.encode_history(history)
-            passing.context_of = state
-        return context
+        passing = self.passing
+        if passing.context_of.changed((*self.belief.context_parameters(), *history)) or passing.context is None:
+            passing.context = self.belief.encode_history(history)
+        return passing.context
 
 
 class BeliefFusion(nn.Module):
@@ -212,10 +225,10 @@ class BeliefFusion(nn.Module):
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: BeliefFeatures) -> th.Tensor:
-        return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(features.own), features.latent], dim=1)))
+        return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(features.own), features.latent], dim=-1)))
 
     def forward_critic(self, features: BeliefFeatures) -> th.Tensor:
-        return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(features.own), features.latent], dim=1)))
+        return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(features.own), features.latent], dim=-1)))
 
     def belief_share(self) -> float:
         """

@@ -23,6 +23,7 @@ from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flatt
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
 from sb3_belief.belief_ppo.terminal_values import TerminalValues
+from sb3_belief.belief_ppo.writes import count_writes
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
@@ -128,11 +129,17 @@ class BeliefPolicyMixin(_Policy):
         if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
             kwargs["optimizer_kwargs"] = _fast_adam(kwargs.get("optimizer_kwargs"))
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
+        self.optimizer.register_step_post_hook(count_writes)
         if self.has_belief and not self.share_features_extractor:
             raise ValueError(
                 "share_features_extractor=False would give the value a belief of its own; policy and value share the belief "
                 "(Sec. 4.2 of the paper). Leave it True, or use belief='none'."
             )
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        # A copied optimiser has no hooks
+        self.optimizer.register_step_post_hook(count_writes)
 
     # -- construction, within SB3's constructor ------------------------------------------------------------------------
 

@@ -74,6 +74,8 @@ class Lockstep:
         self._vote = True
         self._in_round = False
         self.n_steps = 0
+        #: How often agents have ended rollouts and been updated in this ``learn()``
+        self.n_rounds = 0
         self.agent_envs = {agent: AgentVecEnv(self, agent) for agent in self.possible_agents}
 
     @property
@@ -185,7 +187,7 @@ class Lockstep:
         """
         self._members = {agent: members[agent] for agent in self.possible_agents}
         self._main = getcurrent()
-        self.n_steps = 0
+        self.n_steps, self.n_rounds = 0, 0
         # Without any callback nobody could see who has counted a step, nor stop the others: then the second stop is left out
         self._vote = observer.has_callback or any(member.callback is not None for member in members.values())
         try:
@@ -261,7 +263,8 @@ class Lockstep:
         if team_ended:
             ended.clear()
             observer.on_rollout_end()
-        self._in_round = True
+        # Whoever is updated goes on to its next action at once
+        self._in_round, self.n_rounds = True, self.n_rounds + 1
         turns = now
         while turns:
             for agent in turns:

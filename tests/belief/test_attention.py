@@ -108,3 +108,29 @@ def test_the_largest_are_those_of_a_sort(n):
     found = largest(values, n)
     assert found.shape == (6, n) and found.dtype == th.int and found.is_contiguous()
     assert found.equal(values.argsort(dim=1)[:, 8 - n :].sort(dim=1).values.int())
+
+
+@pytest.mark.parametrize("n_kept", [0, 3])
+def test_stacked_agents_attend_each_to_its_own_rows(n_kept):
+    th.manual_seed(0)
+    queries, keys, values = th.randn(2, 5, 4), th.randn(2, 9, 4), th.randn(2, 9, 3)
+    kept = largest(queries @ keys.mT, n_kept)
+    assert all(
+        th.equal(own, chosen_rows)
+        for own, chosen_rows in zip(kept, map(largest, queries @ keys.mT, [n_kept] * 2), strict=True)
+    )
+    with th.no_grad():
+        without_graph = attend(queries, keys, values, kept)
+    for inputs in (queries, keys, values):
+        inputs.requires_grad_()
+    means, weights = attend(queries, keys, values, kept)
+    for ours, theirs in zip(without_graph, (means, weights), strict=True):
+        th.testing.assert_close(ours, theirs)
+    found = th.autograd.grad(means.square().sum(), [queries, keys, values]) if n_kept else ()
+    for i in range(2):
+        own = [part[i].detach().requires_grad_() for part in (queries, keys, values)]
+        expected = attend(own[0], own[1], own[2], kept[i])
+        th.testing.assert_close(means[i], expected[0])
+        th.testing.assert_close(weights[i], expected[1])
+        for ours, theirs in zip(found, th.autograd.grad(expected[0].square().sum(), own) if n_kept else (), strict=True):
+            th.testing.assert_close(ours[i], theirs)

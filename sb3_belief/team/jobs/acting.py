@@ -1,12 +1,12 @@
 """
-Actions chosen in the process that updates the agent.
+Actions chosen together, and in the process that updates the agent.
 
 In a rollout most of the time goes into the policies' passes. A worker still has the networks that it has updated, so it can
 do these passes too, while this process and other workers do those of other agents. All that is sent is the observations and
 where torch's generator stands; actions, values and log-probabilities come back, bit for bit what they would be here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,8 +14,10 @@ import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
+from sb3_belief.belief_ppo.writes import Watch
 from sb3_belief.team.jobs.messages import own_tensor
 from sb3_belief.team.members import ACTS_ELSEWHERE, ACTS_HERE
+from sb3_belief.team.stacking import Part, Together, make
 
 if TYPE_CHECKING:
     from sb3_belief.team.jobs.workers import Workers
@@ -77,8 +79,9 @@ class ActsElsewhere:
     def __init__(self, agent: str, policy: nn.Module, workers: "Workers", worker: int):
         self.policy, self.worker = policy, worker
         self._agent, self._workers = agent, workers
-        self._places: list[Any] = []
-        self._known: list[tuple[int, int]] | None = None
+        self._places: list[Mapping[str, th.Tensor | None]] = []
+        # The last update; None where there was none, or what it left has been changed since
+        self._since: Watch | None = None
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # A copy of the policy acts by itself
@@ -87,17 +90,20 @@ class ActsElsewhere:
     def updated(self) -> None:
         """Called when the worker has just made the weights what they are here."""
         # Where they are kept rather than the tensors: a history is replaced
-        self._places = [*(module._parameters for module in self.policy.modules())]
-        self._places += (module._buffers for module in self.policy.modules())
-        self._known = self._state()
+        self._places = [place for module in self.policy.modules() for place in (module._parameters, module._buffers)]
+        self._since = Watch()
+        self._since.changed(self._tensors())
 
-    def _state(self) -> list[tuple[int, int]]:
-        # PyTorch's counters tell what has been written to
-        return [(t.data_ptr(), t._version) for place in self._places for t in place.values() if t is not None]
+    def _tensors(self) -> list[th.Tensor]:
+        return [tensor for place in self._places for tensor in place.values() if tensor is not None]
+
+    def _is_as_updated(self) -> bool:
+        if self._since is not None and self._since.changed(self._tensors()):
+            self._since = None
+        return self._since is not None
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        here = self._known is None or th.is_grad_enabled() or not self.hub.chooses_actions(self._agent)
-        if here or self._known != self._state():
+        if th.is_grad_enabled() or not self.hub.chooses_actions(self._agent) or not self._is_as_updated():
             return _own_forward(self.policy)(*args, **kwargs)
         try:
             job = Pass(_sent(args), _sent(kwargs), th.get_rng_state().numpy())
@@ -118,43 +124,73 @@ class ActsElsewhere:
 
 class ActsHere:
     """
-    The same for a policy that acts in this process: when the passes of others have been sent, all at once.
+    The same for a policy that acts in this process: when the passes of others have been sent, all at once, and together with
+    others in this process.
 
     :param hub: in which its agent learns
     :param agent: whose policy it is
     :param policy: the policy
     :param workers: the processes
+    :param together: makes the passes of all in this process
     """
 
-    def __init__(self, hub: "Lockstep", agent: str, policy: nn.Module, workers: "Workers"):
-        self._hub, self._agent, self._policy, self._workers = hub, agent, policy, workers
+    def __init__(self, hub: "Lockstep", agent: str, policy: nn.Module, workers: "Workers", together: Together):
+        self._hub, self._agent, self._policy, self._workers, self._together = hub, agent, policy, workers, together
+        self._part, self._rollout = Part(policy), 0
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return _own_forward, (self._policy,)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        if self._hub.chooses_actions(self._agent):
-            self._hub.wait(self._agent, ACTS_HERE)
-            self._workers.flush()
-        return _own_forward(self._policy)(*args, **kwargs)
+        if not self._hub.chooses_actions(self._agent):
+            return _own_forward(self._policy)(*args, **kwargs)
+        if self._rollout != self._hub.n_rounds:
+            # Others' weights, and it may have other networks
+            self._part, self._rollout = Part(self._policy), self._hub.n_rounds
+        is_part = self._part.can_take(*args, **kwargs)
+        if is_part:
+            self._part.prepare(args[0])
+            self._together.join(self._part)
+        self._hub.wait(self._agent, ACTS_HERE)
+        self._workers.flush()
+        if not is_part:
+            return _own_forward(self._policy)(*args, **kwargs)
+        self._together.go_on(self._part)
+        return self._part.finish(*args, **kwargs)
 
 
 def _own_forward(policy: nn.Module) -> Any:
     return type(policy).forward.__get__(policy)
 
 
-def do_pass(policy: Any, job: Pass) -> PassDone | None:
+@th.no_grad()
+def do_passes(parts: Mapping[str, Part], jobs: Mapping[str, Pass]) -> dict[str, PassDone | None]:
     """
-    :param policy: as its update has left it
-    :param job: the pass
-    :return: what has come of it; None if it failed
+    :param parts: of the policies, as their updates have left them
+    :param jobs: the passes, by agent
+    :return: what has come of each; None if it failed
     """
+    given = {agent: (_received(job.args), _received(job.kwargs)) for agent, job in jobs.items()}
+    generators = {agent: th.from_numpy(job.generator) for agent, job in jobs.items()}
+    try:
+        joint = [agent for agent, (args, kwargs) in given.items() if parts[agent].can_take(*args, **kwargs)]
+        for agent in joint:
+            th.set_rng_state(generators[agent])
+            parts[agent].prepare(given[agent][0][0])
+            generators[agent] = th.get_rng_state()
+        make([parts[agent] for agent in joint])
+    except Exception:
+        return {agent: None for agent in jobs}
+    return {agent: _do_pass(parts[agent], *given[agent], generators[agent], agent in joint) for agent in jobs}
+
+
+def _do_pass(part: Part, args: tuple, kwargs: dict, generator: th.Tensor, is_prepared: bool) -> PassDone | None:
+    policy = part.policy
     try:
         if policy.training:
             policy.set_training_mode(False)
-        th.set_rng_state(th.from_numpy(job.generator))
-        with th.no_grad():
-            outputs = policy(*_received(job.args), **_received(job.kwargs))
+        th.set_rng_state(generator)
+        outputs = (part.finish if is_prepared else policy)(*args, **kwargs)
         return PassDone(_sent(outputs), _sent(getattr(policy, "acted_with", None)), th.get_rng_state().numpy())
     except Exception:
         return None

@@ -7,6 +7,7 @@ in a worker process. What was updated there also chooses its actions there, see 
 is the same, bit for bit.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -20,6 +21,7 @@ from sb3_belief.team.jobs.messages import Message
 from sb3_belief.team.jobs.updating import REPLACED, pack, read_stream, unpack_result, write_stream
 from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.team.members import UPDATES, UPDATES_HERE
+from sb3_belief.team.stacking import Together, signature
 
 if TYPE_CHECKING:
     from sb3_belief.team.lockstep import Lockstep
@@ -66,28 +68,30 @@ class Jobs:
     @contextmanager
     def shared_out(self, hub: "Lockstep") -> Iterator[None]:
         """
-        Within the block several processes work for the agents. Workers go on waiting for the next block, unless an error ends
-        this one.
+        Within the block policies act together, and several processes work for the agents. Workers go on waiting for the next
+        block, unless an error ends this one.
 
         :param hub: in which the agents learn
         :raises ValueError: if a model cannot be sent to another process
         """
         models = self._on_policy()
         n_processes = min(self._jobs, len(models))
-        if n_processes < 2:
-            yield
-            return
-        if not self._workers:
-            for agent, model in models.items():
-                # Said now rather than after a first long rollout
-                _pack(agent, model)
-        if self._workers.start(n_processes - 1):
-            self._acts.clear()
+        if n_processes > 1:
+            self._start(models, n_processes - 1)
+        together, signatures = Together(), {agent: signature(model.policy) for agent, model in models.items()}
+        alike = Counter(found for found in signatures.values() if found is not None)
         replaced: list[Any] = []
         try:
             for i, (agent, model) in enumerate(models.items()):
                 replaced += [model, model.policy]
-                self._share_out(hub, agent, model, i % n_processes if (i + 1) % n_processes else None)
+                worker = i % n_processes if (i + 1) % n_processes else None
+                if n_processes > 1:
+                    self._share_update(hub, agent, model, worker)
+                if worker is not None:
+                    self._act_elsewhere(hub, agent, model, worker)
+                elif "forward" not in vars(model.policy) and (n_processes > 1 or alike[signatures[agent]] > 1):
+                    acts = ActsHere(hub, agent, model.policy, self._workers, together)
+                    model.policy.forward = acts  # type: ignore[method-assign]
             yield
         except BaseException:
             self._workers.end()
@@ -97,16 +101,24 @@ class Jobs:
                 for name in (*REPLACED, "forward"):
                     vars(owner).pop(name, None)
 
-    def _share_out(self, hub: "Lockstep", agent: str, model: OnPolicyAlgorithm, worker: int | None) -> None:
+    def _start(self, models: Mapping[str, OnPolicyAlgorithm], n_workers: int) -> None:
+        if not self._workers:
+            for agent, model in models.items():
+                # Said now rather than after a first long rollout
+                _pack(agent, model)
+        if self._workers.start(n_workers):
+            self._acts.clear()
+
+    def _share_update(self, hub: "Lockstep", agent: str, model: OnPolicyAlgorithm, worker: int | None) -> None:
         excluded = [*model._excluded_save_params(), *REPLACED]
         # A model that is saved meanwhile is saved as always
         model._excluded_save_params = partial(list, excluded)  # type: ignore[method-assign]
         if worker is None:
             model.train = partial(_train_here, hub, agent, model)  # type: ignore[method-assign]
-            if "forward" not in vars(model.policy):
-                model.policy.forward = ActsHere(hub, agent, model.policy, self._workers)  # type: ignore[method-assign]
-            return
-        model.train = partial(self._train, hub, agent, model, worker)  # type: ignore[method-assign]
+        else:
+            model.train = partial(self._train, hub, agent, model, worker)  # type: ignore[method-assign]
+
+    def _act_elsewhere(self, hub: "Lockstep", agent: str, model: OnPolicyAlgorithm, worker: int) -> None:
         if can_act_elsewhere(model):
             acts = self._acts.get(agent)
             if acts is None or acts.policy is not model.policy or acts.worker != worker:

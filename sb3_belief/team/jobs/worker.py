@@ -17,10 +17,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
-from sb3_belief.team.jobs.acting import do_pass
+from sb3_belief.team.jobs.acting import do_passes
 from sb3_belief.team.jobs.messages import Message, dumps, loads, receive, send
 from sb3_belief.team.jobs.updating import STAYS, modules_of, optimizers_of, read_stream, tensors_of, write_stream
 from sb3_belief.team.processes import leave_interrupts_to_main
+from sb3_belief.team.stacking import Part
 
 # What PyTorch keeps in every module: parameters and submodules, which are looked at by themselves, and hooks
 _MODULE_KEYS = set(vars(nn.Module())) - {"training"}
@@ -39,13 +40,16 @@ def serve(connection: Connection) -> None:
     results: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()
     threading.Thread(target=_receive_jobs, args=(connection, jobs), daemon=True).start()
     threading.Thread(target=_send_results, args=(connection, results), daemon=True).start()
-    policies: dict[str, Any] = {}
+    parts: dict[str, Part] = {}
     while (given := jobs.get()) is not None:
         agent, job = given
         if agent is None:
-            results.put((None, {name: do_pass(policies.get(name), single) for name, single in job.items()}))
+            results.put((None, do_passes(parts, job)))
         else:
-            result, policies[agent] = update(job)
+            result, policy = update(job)
+            parts.pop(agent, None)
+            if policy is not None:
+                parts[agent] = Part(policy)
             results.put((agent, result))
 
 
