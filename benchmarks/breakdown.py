@@ -23,6 +23,7 @@ from sb3_belief import Team
 from sb3_belief.belief_ppo import algorithm
 from sb3_belief.team.joint_env import JointEnv
 from sb3_belief.team.parallel_vec_env import ParallelTeamVecEnv
+from sb3_belief.team.stacking import networks, passes
 
 UPDATE = "update"
 
@@ -83,6 +84,10 @@ class Clocks(ExitStack):
         self.wrap(team._hub._views, "split", "transfer")
         for model in team.agents.values():
             self._wrap_model(model)
+        # Policies with equal networks act together
+        for owner, method in ((passes.Part, "prepare"), (passes, "make"), (passes.Part, "finish")):
+            self.wrap(owner, method, "policy")
+        self.wrap(networks.StackedNetworks, "believe", "belief")
         self.wrap(th.Tensor, "backward", "backward")
         self.wrap(algorithm, "measure_belief", "belief diagnostics")
 
@@ -92,8 +97,7 @@ class Clocks(ExitStack):
         self.wrap(model, "_update_info_buffer", "buffer")
         for method in ("add", "reset", "compute_returns_and_advantage", "_get_samples", "recent"):
             self.wrap(model.rollout_buffer, method, "buffer")
-        for method in ("forward", "predict_values"):
-            self.wrap(policy, method, "policy")
+        self.wrap(policy, "predict_values", "policy")
         self.wrap(policy.optimizer, "step", "optimiser")
         if getattr(policy, "has_belief", False):
             self.wrap(policy, "remember", "belief")

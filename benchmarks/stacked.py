@@ -1,12 +1,12 @@
 """
-What would it bring to batch agents of equal shape into one set of stacked kernels? The experiment behind docs/performance.md.
+What would it bring to update agents of equal shape with one set of stacked kernels? The experiment behind docs/performance.md.
 
     python -m benchmarks.stacked
 
-One gradient step of PPO with a belief for each of several agents: one agent after the other, as a team does it; all at once,
-with their weights stacked to ``[agents, out, in]``; and in lockstep, where only the passes forward and backward are stacked,
-and each agent has its own loss, clipping and optimiser, as SB3 would have it. The row of a single agent shows what is saved
-by leaving out what SB3's policies do besides.
+Gradient steps of PPO with a belief for several agents: all those of one agent and then those of the next, as a team does them;
+all agents' at once, with their weights stacked to ``[agents, out, in]``; and in lockstep, where only the passes forward and
+backward are stacked, and each agent has its own loss, clipping and optimiser, as SB3 would have it. The row of a single agent
+shows what is saved by leaving out what SB3's policies do besides.
 
 It prints milliseconds of a step of all agents, medians of rounds in turn, how many times as long one by one takes (quartiles
 in brackets), and the largest difference of any weight after the first step. On the CPU these are CPU seconds of one thread,
@@ -14,6 +14,7 @@ on a GPU, where there is one, seconds on the wall.
 """
 
 import argparse
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -101,16 +102,19 @@ class OneByOne:
     def __init__(self, policies: list[BeliefActorCriticPolicy], batches: list[Batch]) -> None:
         self.policies, self.batches = policies, batches
 
-    def step(self) -> None:
-        """One gradient step of each agent."""
+    def steps(self, n: int) -> None:
+        """
+        :param n: gradient steps of each agent, one agent after the other: what it works on stays in the processor's caches
+        """
         for policy, batch in zip(self.policies, self.batches, strict=True):
-            policy.stage(batch.belief)
-            values, log_prob, _ = policy.evaluate_actions(batch.observations, batch.actions)
-            loss = ppo_loss(log_prob, values.flatten(), batch)
-            policy.optimizer.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(policy.parameters(), MAX_NORM)
-            policy.optimizer.step()
+            for _ in range(n):
+                policy.stage(batch.belief)
+                values, log_prob, _ = policy.evaluate_actions(batch.observations, batch.actions)
+                loss = ppo_loss(log_prob, values.flatten(), batch)
+                policy.optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(policy.parameters(), MAX_NORM)
+                policy.optimizer.step()
 
     def weights(self) -> dict[str, th.Tensor]:
         """
@@ -120,7 +124,7 @@ class OneByOne:
         return {name: th.stack([weights[name].detach() for weights in named]) for name in named[0]}
 
 
-class StackedPasses:
+class StackedPasses(ABC):
     """
     Weights, histories and minibatches of all agents, stacked, and the passes forward of all at once.
 
@@ -138,9 +142,6 @@ class StackedPasses:
         tensors = [batch[:-1] for batch in batches]
         observations, actions, old_log_prob, advantages, returns = map(th.stack, zip(*tensors, strict=True))
         self._batch = Batch(observations, actions, old_log_prob, advantages, returns, belief)
-        # All agents' rows stand below each other in one table
-        first = HISTORY * th.arange(len(policies), dtype=th.int, device=belief.kept.device)
-        self._kept = (belief.kept + first[:, None, None]).flatten(0, 1)
 
     def _linear(self, name: str, inputs: th.Tensor) -> th.Tensor:
         weight, bias = self._weights[f"{name}.weight"].mT, self._weights.get(f"{name}.bias")
@@ -157,9 +158,8 @@ class StackedPasses:
         embedding = embed(self._batch.observations)
         states = embed(self._history.observations) + self._linear(f"{name}.action_embedding", self._history.actions)
         queries = self._linear(f"{name}.query", embedding) @ (self._weights[f"{name}.key.weight"] / states.shape[2] ** 0.5)
-        table = states.flatten(0, 1)
-        means, _ = attend(queries.flatten(0, 1), table, table, self._kept)
-        embedding = embedding + self._linear(f"{name}.value", means.view_as(embedding))
+        means, _ = attend(queries, states, states, self._batch.belief.kept)
+        embedding = embedding + self._linear(f"{name}.value", means)
         mean, log_std = self._linear(f"{name}.encoder", embedding).chunk(2, dim=2)
         log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
         latent = mean + log_std.exp() * self._batch.belief.noise
@@ -184,6 +184,17 @@ class StackedPasses:
         log_prob = log_probs.gather(2, self._batch.actions[:, :, None]).squeeze(2)
         return self._linear("value_net", codes[1]).squeeze(2), log_prob, belief_loss
 
+    @abstractmethod
+    def _step(self) -> None:
+        """One gradient step of each agent."""
+
+    def steps(self, n: int) -> None:
+        """
+        :param n: gradient steps of each agent
+        """
+        for _ in range(n):
+            self._step()
+
     def weights(self) -> dict[str, th.Tensor]:
         """
         :return: all agents' weights by name, ``[agents, ...]``
@@ -203,8 +214,7 @@ class Stacked(StackedPasses):
         super().__init__(policies, batches)
         self._optimizer = th.optim.Adam(self._weights.values(), LEARNING_RATE, eps=1e-5, fused=True)
 
-    def step(self) -> None:
-        """One gradient step of each agent."""
+    def _step(self) -> None:
         values, log_prob, belief_loss = self.passes()
         self._optimizer.zero_grad()
         (ppo_loss(log_prob, values, self._batch).sum() + belief_loss).backward()
@@ -236,8 +246,7 @@ class InLockstep(StackedPasses):
         self._own = [[w.detach()[i].requires_grad_() for w in self._weights.values()] for i in range(len(policies))]
         self._optimizers = [th.optim.Adam(own, LEARNING_RATE, eps=1e-5, fused=True) for own in self._own]
 
-    def step(self) -> None:
-        """One gradient step of each agent."""
+    def _step(self) -> None:
         values, log_prob, belief_loss = self.passes()
         gradients = []
         for i, batch in enumerate(self._batches):
@@ -289,10 +298,10 @@ def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> Com
     # Those that copy the weights before the one that trains the policies themselves
     ways = {name: WAYS[name](policies, batches) for name in reversed(WAYS)}
     for way in ways.values():
-        way.step()
+        way.steps(1)
     expected = ways["one by one"].weights()
     differences = [(way.weights()[name] - weights).abs().max() for way in ways.values() for name, weights in expected.items()]
-    samples = alternate({name: _loop(way.step, device) for name, way in ways.items()}, rounds)
+    samples = alternate({name: _loop(way.steps, device) for name, way in ways.items()}, rounds)
     clock = "cpu" if device == "cpu" else "wall"
     return Comparison(
         {name: spread([1 / speed for speed in speeds(samples[name], clock)]) for name in WAYS},
@@ -301,13 +310,12 @@ def compare(n_agents: int, n_rows: int, rounds: int, device: str = "cpu") -> Com
     )
 
 
-def _loop(step: Callable[[], None], device: str, steps: int = 3) -> Loop:
+def _loop(steps: Callable[[int], None], device: str, n: int = 8) -> Loop:
     def loop() -> int:
-        for _ in range(steps):
-            step()
+        steps(n)
         if device != "cpu":
             th.cuda.synchronize()
-        return steps
+        return n
 
     return loop
 

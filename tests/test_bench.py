@@ -16,7 +16,7 @@ AGENT_STEPS = 32
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
     out = tmp_path_factory.mktemp("bench") / "out" / "bench.json"
-    bench.main(["--quick", "--parts", "a", "b", "c", "d", "cores", "--out", str(out)])
+    bench.main(["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "--out", str(out)])
     return json.loads(Path(out).read_text())
 
 
@@ -43,6 +43,8 @@ def test_steps_are_counted_as_they_were_done(written):
     assert spread_rows == [[8 * 8]] * 5
     junction_rows = [steps for (part, _), steps in rows.items() if part == "b"]
     assert junction_rows == [[4 * 8]] * 2
+    together = [steps for (part, _), steps in rows.items() if part == "together"]
+    assert together == [[8 * 8]] * 4 + [[4 * 8]] * 4
     for n in (5, 20):
         for kind in ("fixed others", "all learn", "no belief"):
             assert rows["agents", f"{n} agents, {kind}"] == [n * AGENT_STEPS]
@@ -88,9 +90,8 @@ def test_a_stacked_step_is_that_of_each_agent(way):
     batches = [stacked.make_batch(16, "cpu") for _ in policies]
     together, apart = way(policies, batches), stacked.OneByOne(policies, batches)
     before = apart.weights()
-    for _ in range(2):
-        together.step()
-        apart.step()
+    together.steps(2)
+    apart.steps(2)
     found, expected = together.weights(), apart.weights()
     assert found.keys() == expected.keys()
     for name, weights in expected.items():

@@ -123,8 +123,16 @@ class StackedNetworks:
         self._refresh()
         if not self._extractors:
             return *self._codes(flat), None
-        belief = self._belief(flat, None, noise, None, self._context, predict=False)
+        belief = self.believe(flat, noise)
         return *self._codes(self._extractors[0].beside(flat, belief)), belief
+
+    def believe(self, flat: th.Tensor, noise: th.Tensor | None) -> BeliefOutput:
+        """
+        :param flat: as above
+        :param noise: as above
+        :return: the beliefs
+        """
+        return self._belief(flat, None, noise, None, self._context, predict=False)
 
     def _refresh(self) -> None:
         histories = [extractor.history for extractor in self._extractors]
