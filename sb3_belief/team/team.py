@@ -42,7 +42,8 @@ class Team:
     The models are unmodified SB3 ones and share nothing: weights, buffers, normalisation, loggers and random streams are
     each agent's own. With ``seed=s`` the environment is seeded with ``s`` as SB3 models do it, and agent k's model with
     ``agent_seed(s, k)``, so that equal networks start differently and no agent's learning depends on how many random numbers
-    another draws. One timestep is one joint step of one copy of the environment.
+    another draws. Policies of equal shape act together, in one pass with their weights stacked, to the same bits. One timestep
+    is one joint step of one copy of the environment.
 
     ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps`` and ``logger`` are those of an SB3
     model, so that ``evaluate_policy`` and SB3's callbacks take a team as it is.
