@@ -187,6 +187,25 @@ def test_who_has_a_callback_acts_alone(sizes):
     assert all({"forward", "mlp_extractor", "extract_features"}.isdisjoint(vars(m.policy)) for m in team.agents.values())
 
 
+def test_what_a_user_has_replaced_stays(sizes):
+    team = toy_team(env_id=lambda: ToyEnv(4))
+    models = [team.agents[f"agent_{i}"] for i in range(4)]
+    asked, trained = [], []
+
+    def forward(obs):
+        asked.append(len(obs))
+        return type(models[0].policy).forward(models[0].policy, obs)
+
+    def train():
+        trained.append(True)
+        PPO.train(models[1])
+
+    models[0].policy.forward, models[1].train = forward, train
+    team.learn(8 * 16)
+    assert (models[0].policy.forward, models[1].train) == (forward, train)
+    assert len(asked) == 16 and len(trained) == 2 and sizes == [3] * 16
+
+
 def make_policies(n):
     others = {"other": spaces.Discrete(3)}
     space = spaces.Box(-10, 10, (6,)), spaces.Discrete(5)

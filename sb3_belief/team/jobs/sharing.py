@@ -62,8 +62,7 @@ class Jobs:
                     f"jobs={self._jobs} is for models on the CPU, but that of {agent!r} is on {model.device}: use jobs=1, or"
                     ' device="cpu".'
                 )
-        # A user may have replaced a model's train() in the same way as is done here, which can then run here only
-        return {agent: model for agent, model in found.items() if "train" not in vars(model)}
+        return found
 
     @contextmanager
     def shared_out(self, hub: "Lockstep") -> Iterator[None]:
@@ -75,21 +74,25 @@ class Jobs:
         :raises ValueError: if a model cannot be sent to another process
         """
         models = self._on_policy()
-        n_processes = min(self._jobs, len(models))
+        # A user may have replaced a model's train() in the same way as is done here, which can then run here only
+        shared = [agent for agent, model in models.items() if "train" not in vars(model)]
+        n_processes = min(self._jobs, len(shared))
         if n_processes > 1:
-            self._start(models, n_processes - 1)
+            self._start({agent: models[agent] for agent in shared}, n_processes - 1)
+        else:
+            shared = []
+        # None: this process
+        workers = {agent: i % n_processes if (i + 1) % n_processes else None for i, agent in enumerate(shared)}
         together, signatures = Together(), {agent: signature(model.policy) for agent, model in models.items()}
         alike = Counter(found for found in signatures.values() if found is not None)
-        replaced: list[Any] = []
         try:
-            for i, (agent, model) in enumerate(models.items()):
-                replaced += [model, model.policy]
-                worker = i % n_processes if (i + 1) % n_processes else None
-                if n_processes > 1:
+            for agent, model in models.items():
+                worker = workers.get(agent)
+                if agent in workers:
                     self._share_update(hub, agent, model, worker)
                 if worker is not None:
                     self._act_elsewhere(hub, agent, model, worker)
-                elif "forward" not in vars(model.policy) and (n_processes > 1 or alike[signatures[agent]] > 1):
+                elif "forward" not in vars(model.policy) and (shared or alike[signatures[agent]] > 1):
                     acts = ActsHere(hub, agent, model.policy, self._workers, together)
                     model.policy.forward = acts  # type: ignore[method-assign]
             yield
@@ -97,9 +100,11 @@ class Jobs:
             self._workers.end()
             raise
         finally:
-            for owner in replaced:
-                for name in (*REPLACED, "forward"):
-                    vars(owner).pop(name, None)
+            for agent, model in models.items():
+                for name in REPLACED if agent in workers else ():
+                    vars(model).pop(name, None)
+                if isinstance(vars(model.policy).get("forward"), (ActsHere, ActsElsewhere)):
+                    del vars(model.policy)["forward"]
 
     def _start(self, models: Mapping[str, OnPolicyAlgorithm], n_workers: int) -> None:
         if not self._workers:
