@@ -49,7 +49,7 @@ conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our a
 	$(BIN)/python -m tests.conformance.fetch
 	$(BIN)/python -m tests.conformance.run $(CONFORMANCE_ARGS)
 
-bench: $(STAMP)  ## measure speed and memory (15 minutes), into benchmarks/out/bench.json
+bench: $(STAMP)  ## measure speed and memory (20 minutes), into benchmarks/out/bench.json
 	$(BIN)/python -m benchmarks.bench $(BENCH_ARGS)
 
 # each of the other libraries has an environment of its own; one that cannot be made is skipped, and its log says why
