@@ -238,3 +238,10 @@ def test_a_pass_that_fails_in_a_worker_is_left_to_the_team():
     generator = th.get_rng_state().numpy()
     jobs = {"0": Pass((th.randn(8, 6),), {}, generator), "1": Pass((th.randn(8, 7),), {}, generator)}
     assert do_passes({str(i): Part(policy) for i, policy in enumerate(policies)}, jobs) == {"0": None, "1": None}
+
+
+def test_a_policy_unlike_any_of_sb3_acts_by_itself():
+    with th.no_grad():
+        assert not Part(th.nn.Linear(2, 2)).can_take(th.zeros(1, 2))
+        assert Part(make_policies(1)[0]).can_take(th.zeros(1, 6))
+    assert not Part(make_policies(1)[0]).can_take(th.zeros(1, 6))

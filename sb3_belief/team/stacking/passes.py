@@ -54,7 +54,7 @@ class Part:
         self.policy = policy
         found = signature(policy)
         self._signature = None if found is None else _numbers.setdefault(found, len(_numbers))
-        extractor = policy.features_extractor
+        extractor = getattr(policy, "features_extractor", None)
         self._extractor = extractor if isinstance(extractor, BeliefExtractor) else None
         self._counted, self._n_rows = Watch(), 0
         # With whom it is made together, if it is the first of them
