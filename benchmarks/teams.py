@@ -7,7 +7,7 @@ from unittest import mock
 from stable_baselines3 import PPO
 
 from sb3_belief import BeliefPPO, Team, make_team_env
-from sb3_belief.team.jobs import sharing
+from sb3_belief.team.stacking import passes
 from sb3_belief.zoo.config import RunConfig, load_config
 
 #: The beliefs that are compared; "ippo" is BeliefPPO without one
@@ -102,5 +102,5 @@ class ApartLoop(TeamLoop):
     """The same, where no policies act together: each makes its own passes."""
 
     def __call__(self) -> int:
-        with mock.patch.object(sharing, "signature", lambda policy: None):
+        with mock.patch.object(passes, "signature", lambda policy: None):
             return super().__call__()

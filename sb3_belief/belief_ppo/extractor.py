@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
-from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
@@ -24,6 +26,15 @@ def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
     if isinstance(observation, dict):
         return th.cat([observation[key].flatten(1).float() for key in sorted(observation)], dim=1)
     return observation.flatten(1).float()
+
+
+def flat_observations(policy: BasePolicy, observations: PyTorchObs) -> th.Tensor:
+    """
+    :param policy: Whose observations they are
+    :param observations: As the environment gives them, batch first
+    :return: Preprocessed as SB3 does, and flat, ``[B, d_o]``
+    """
+    return flatten_observation(preprocess_obs(observations, policy.observation_space, policy.normalize_images))
 
 
 class BeliefFeatures(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
@@ -19,7 +19,7 @@ from torch.distributions import Distribution
 from sb3_belief.belief import ACTION_LOSSES, DynamicBelief, History, expected_actions, kl_divergence
 from sb3_belief.belief_ppo.auxiliary import add_loss
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flatten_observation
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flat_observations
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
 from sb3_belief.belief_ppo.terminal_values import TerminalValues
@@ -253,8 +253,7 @@ class BeliefPolicyMixin(_Policy):
         :param observations: Observations as the environment gives them, batch first
         :return: As belief and history take them: preprocessed as SB3 does, and flat, ``[B, d_o]``
         """
-        preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
-        return flatten_observation(preprocessed)
+        return flat_observations(self, observations)
 
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 

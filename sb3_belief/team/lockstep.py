@@ -245,7 +245,7 @@ class Lockstep:
         return self._go_on and all_together
 
     def _await_actions(self, streams: StreamSwitch) -> None:
-        """With several processes: first those act who do so in this one, while the others are busy."""
+        """First those act who do so in this process, together where they can, while others are busy."""
         for state in (ACTS_HERE, ACTS_ELSEWHERE):
             for agent, member in self._members.items():
                 if member.state == state:

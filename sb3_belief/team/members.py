@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
 # With updates in several processes: it is to be updated in this one, or waits for the others to be
 UPDATES_HERE, UPDATES = "updates here", "updates"
-# The same for its next action
+# The same for its next action; also with one process, where policies act together
 ACTS_HERE, ACTS_ELSEWHERE = "acts here", "acts elsewhere"
 
 

@@ -129,14 +129,14 @@ class ActsHere:
 
     :param hub: in which its agent learns
     :param agent: whose policy it is
-    :param policy: the policy
+    :param part: of its policy
     :param workers: the processes
     :param together: makes the passes of all in this process
     """
 
-    def __init__(self, hub: "Lockstep", agent: str, policy: nn.Module, workers: "Workers", together: Together):
-        self._hub, self._agent, self._policy, self._workers, self._together = hub, agent, policy, workers, together
-        self._part, self._rollout = Part(policy), 0
+    def __init__(self, hub: "Lockstep", agent: str, part: Part, workers: "Workers", together: Together):
+        self._hub, self._agent, self._policy, self._workers, self._together = hub, agent, part.policy, workers, together
+        self._part, self._rollout = part, 0
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         return _own_forward, (self._policy,)

@@ -21,7 +21,7 @@ from sb3_belief.team.jobs.messages import Message
 from sb3_belief.team.jobs.updating import REPLACED, pack, read_stream, unpack_result, write_stream
 from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.team.members import UPDATES, UPDATES_HERE
-from sb3_belief.team.stacking import Together, signature
+from sb3_belief.team.stacking import Part, Together
 
 if TYPE_CHECKING:
     from sb3_belief.team.lockstep import Lockstep
@@ -83,8 +83,8 @@ class Jobs:
             shared = []
         # None: this process
         workers = {agent: i % n_processes if (i + 1) % n_processes else None for i, agent in enumerate(shared)}
-        together, signatures = Together(), {agent: signature(model.policy) for agent, model in models.items()}
-        alike = Counter(found for found in signatures.values() if found is not None)
+        together, parts = Together(), {agent: Part(model.policy) for agent, model in models.items()}
+        alike: Counter[int | None] = Counter(part.signature for part in parts.values() if part.signature is not None)
         try:
             for agent, model in models.items():
                 worker = workers.get(agent)
@@ -92,8 +92,8 @@ class Jobs:
                     self._share_update(hub, agent, model, worker)
                 if worker is not None:
                     self._act_elsewhere(hub, agent, model, worker)
-                elif "forward" not in vars(model.policy) and (shared or alike[signatures[agent]] > 1):
-                    acts = ActsHere(hub, agent, model.policy, self._workers, together)
+                elif "forward" not in vars(model.policy) and (shared or alike[parts[agent].signature] > 1):
+                    acts = ActsHere(hub, agent, parts[agent], self._workers, together)
                     model.policy.forward = acts  # type: ignore[method-assign]
             yield
         except BaseException:

@@ -12,10 +12,9 @@ from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import torch as th
-from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_belief.belief import BeliefOutput
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, flatten_observation
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, flat_observations
 from sb3_belief.belief_ppo.writes import Watch
 from sb3_belief.team.stacking.networks import StackedNetworks, signature
 
@@ -53,7 +52,8 @@ class Part:
     def __init__(self, policy: Any):
         self.policy = policy
         found = signature(policy)
-        self._signature = None if found is None else _numbers.setdefault(found, len(_numbers))
+        #: Equal for policies of equal networks; None for one that can only act by itself
+        self.signature = None if found is None else _numbers.setdefault(found, len(_numbers))
         extractor = getattr(policy, "features_extractor", None)
         self._extractor = extractor if isinstance(extractor, BeliefExtractor) else None
         self._counted, self._n_rows = Watch(), 0
@@ -68,15 +68,13 @@ class Part:
         :return: whether such a pass can be made together with others
         """
         is_usual = len(args) == 1 and isinstance(args[0], th.Tensor) and kwargs.keys() <= {"action_masks"}
-        return self._signature is not None and is_usual and not th.is_grad_enabled()
+        return self.signature is not None and is_usual and not th.is_grad_enabled()
 
     def prepare(self, obs: th.Tensor) -> None:
         """
         :param obs: as ``forward`` takes it; what is to be drawn for the belief about it is drawn now
         """
-        policy = self.policy
-        preprocessed = preprocess_obs(obs, policy.observation_space, normalize_images=policy.normalize_images)
-        self._flat = flatten_observation(preprocessed)
+        self._flat = flat_observations(self.policy, obs)
         self._noise = None if self._extractor is None else self._extractor.draw_noise(self._flat)
         self.codes = None
 
@@ -86,7 +84,7 @@ class Part:
         history = None if self._extractor is None else self._extractor.history
         if history is not None and self._counted.changed([history.valid]):
             self._n_rows = int(history.valid.sum())
-        return self._signature, self._flat.shape, self._n_rows
+        return self.signature, self._flat.shape, self._n_rows
 
     def _own_codes(self, flat: th.Tensor, noise: th.Tensor | None) -> Codes:
         belief: BeliefOutput | None = None
@@ -101,20 +99,22 @@ class Part:
         """Make a pass of its own."""
         self.codes = self._own_codes(self._flat, self._noise)
 
-    def make_with(self, others: list["Part"]) -> bool:
+    def make_with(self, others: list["Part"], kind: Hashable) -> bool:
         """
         :param others: of the same kind; all are given their codes
+        :param kind: theirs
         :return: whether they were: not if those of their own passes would be others
         """
-        group = [self, *others]
+        group, shape = [self, *others], (1 + len(others), kind)
+        if shape in _agrees and not _agrees[shape]:
+            return False
         if others != self._others:
             self._others, self._networks = others, StackedNetworks([part.policy for part in group])
         assert self._networks is not None
-        shape = len(group), self.kind
         if shape not in _agrees:
             _agrees[shape] = self._try_out(group, self._networks)
-        if not _agrees[shape]:
-            return False
+            if not _agrees[shape]:
+                return False
         noise = None if self._noise is None else th.stack([part._noise for part in group])  # type: ignore[misc]
         made = self._networks(th.stack([part._flat for part in group]), noise)
         for i, part in enumerate(group):
@@ -193,7 +193,7 @@ def make(parts: Sequence[Part]) -> None:
     kinds: dict[Hashable, list[Part]] = defaultdict(list)
     for part in parts:
         kinds[part.kind].append(part)
-    for first, *others in kinds.values():
-        if not (others and first.make_with(others)):
+    for kind, (first, *others) in kinds.items():
+        if not (others and first.make_with(others, kind)):
             for part in (first, *others):
                 part.make_alone()
