@@ -1,4 +1,11 @@
-"""Two cores against one: Traffic Junction's ten agents with a belief, side by side or one after the other."""
+"""
+Two cores against one: Traffic Junction's ten agents with a belief, side by side or one after the other.
+
+``two_processes_vs_one`` is the control: two such teams, each in a process of its own and without a word between them, against
+one alone. A team cannot gain more from the two cores than that.
+"""
+
+from multiprocessing.connection import Connection
 
 import torch as th
 
@@ -6,8 +13,9 @@ from benchmarks.measure import cores, ratio
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop, junction_team
 from sb3_belief import Team
+from sb3_belief.team.processes import start_context
 
-_KEY = "two_cores_vs_one"
+_KEY, _CONTROL = "two_cores_vs_one", "two_processes_vs_one"
 
 
 def largest_difference(a: Team, b: Team) -> float:
@@ -23,6 +31,42 @@ def largest_difference(a: Team, b: Team) -> float:
     return max(differences)
 
 
+class _TwoTeams:
+    """
+    A team in this process and another in one of its own, which learn at the same time.
+
+    :param quick: see ``junction_team``
+    """
+
+    def __init__(self, quick: bool) -> None:
+        context = start_context()
+        self._other, there = context.Pipe()
+        self._process = context.Process(target=_learn_when_told, args=(there, quick), daemon=True)
+        self._process.start()
+        there.close()
+        self._own = TeamLoop(junction_team("belief_ppo", quick))
+
+    def __call__(self) -> int:
+        self._other.send(None)
+        return self._own() + self._other.recv()
+
+    def end(self) -> None:
+        """End the other process."""
+        self._other.close()
+        self._process.join()
+
+
+def _learn_when_told(connection: Connection, quick: bool) -> None:
+    th.set_num_threads(1)
+    loop = TeamLoop(junction_team("belief_ppo", quick))
+    try:
+        while True:
+            connection.recv()
+            connection.send(loop())
+    except EOFError:
+        pass
+
+
 def run(report: Report) -> None:
     """
     :param report: what is found goes there
@@ -33,8 +77,12 @@ def run(report: Report) -> None:
         return
     loops = {f"{n} job{'s' * (n > 1)}": TeamLoop(junction_team("belief_ppo", report.quick, jobs=n)) for n in (1, 2)}
     one, two = loops.values()
-    samples = report.measure("cores", loops)
+    teams = _TwoTeams(report.quick)
+    samples = report.measure("cores", {**loops, "2 teams": teams})
+    teams.end()
     report.add_ratio(_KEY, ratio(samples["2 jobs"], samples["1 job"], "wall"), "wall speed with two jobs / one")
+    control = ratio(samples["2 teams"], samples["1 job"], "wall")
+    report.add_ratio(_CONTROL, control, "wall speed of two teams in processes of their own / one alone")
     with th.no_grad():
         difference = largest_difference(one.team, two.team)
     report.time["cores"] = {"largest_difference_of_parameters": difference}

@@ -4,12 +4,14 @@ Do workers pay for an environment whose step is heavy? Eight copies in workers, 
 ``burns``: 10 ms of CPU time (a simulator); ideal are as many copies at once as there are cores, so cores / 10 ms steps per
 wall second. ``sleeps``: 10 ms of waiting (a server); ideal are all copies at once, so 8 / 10 ms. ``workers_vs_ideal`` is what
 stepping with random actions reaches of that, the lower of the two. A team that learns in them acts and trains between the
-steps, which the ideal does not count; it is shown beside.
+steps, which the ideal does not count; it is shown beside. So is the control: processes that do nothing but burn or sleep when
+told, which is the most that could be reached.
 """
 
 import time
 from collections.abc import Callable
 from functools import partial
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,27 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
-from benchmarks.measure import Spread, cores, speeds, spread
+from benchmarks.measure import Loop, Spread, cores, speeds, spread
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop
 from sb3_belief import Team, make_team_env
 from sb3_belief.team import TeamVecEnv
+from sb3_belief.team.processes import start_context
 
 SECONDS, COPIES, EPISODE = 0.01, 8, 25
+
+
+def pass_time(kind: str) -> None:
+    """
+    :param kind: ``"burns"`` CPU time or ``"sleeps"``
+    """
+    if kind == "sleeps":
+        time.sleep(SECONDS)
+        return
+    # Its own CPU time: by the clock on the wall, workers that share a core would all be done at once
+    end = time.thread_time() + SECONDS
+    while time.thread_time() < end:
+        pass
 
 
 class HeavyEnv(ParallelEnv):
@@ -54,13 +70,7 @@ class HeavyEnv(ParallelEnv):
         return self._observe(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
-        if self.kind == "sleeps":
-            time.sleep(SECONDS)
-        else:
-            # Its own CPU time: by the clock on the wall, workers that share a core would all be done at once
-            end = time.thread_time() + SECONDS
-            while time.thread_time() < end:
-                pass
+        pass_time(self.kind)
         self._time += 1
         over = self._time == EPISODE
         acted = self.agents
@@ -87,6 +97,44 @@ class _Steps:
         return len(self.actions) * self.env.num_envs
 
 
+class _Bare:
+    """Processes that only let the time pass, behind pipes: the control."""
+
+    def __init__(self, kind: str, copies: int, n_steps: int) -> None:
+        context = start_context()
+        self._n_steps = n_steps
+        pipes = [context.Pipe() for _ in range(copies)]
+        self._connections = [here for here, _ in pipes]
+        self._processes = [context.Process(target=_pass_time_when_told, args=(there, kind), daemon=True) for _, there in pipes]
+        for process, (_, there) in zip(self._processes, pipes, strict=True):
+            process.start()
+            there.close()
+
+    def __call__(self) -> int:
+        for _ in range(self._n_steps):
+            for connection in self._connections:
+                connection.send_bytes(b"s")
+            for connection in self._connections:
+                connection.recv_bytes()
+        return self._n_steps * len(self._connections)
+
+    def close(self) -> None:
+        """End the processes."""
+        for connection, process in zip(self._connections, self._processes, strict=True):
+            connection.close()
+            process.join()
+
+
+def _pass_time_when_told(connection: Connection, kind: str) -> None:
+    try:
+        while True:
+            connection.recv_bytes()
+            pass_time(kind)
+            connection.send_bytes(b"s")
+    except EOFError:
+        pass
+
+
 def _learner(env: TeamVecEnv, n_steps: int) -> TeamLoop:
     settings: dict[str, Any] = dict(n_steps=n_steps, batch_size=n_steps * env.num_envs // 2, n_epochs=4, device="cpu")
     return TeamLoop(Team(PPO, "MlpPolicy", env, seed=0, **settings))
@@ -103,11 +151,15 @@ def run(report: Report) -> None:
     shares: dict[str, Spread] = {}
     for kind, best in ideal.items():
         envs = [make_team_env(partial(HeavyEnv, kind), n_envs=copies, vec_env="subproc") for _ in makers]
-        loops = {f"{kind}, {name}": make(env, n_steps) for (name, make), env in zip(makers.items(), envs, strict=True)}
-        samples = report.measure("workers", loops)
+        bare = _Bare(kind, copies, n_steps)
+        loops: dict[str, Loop] = {
+            f"{kind}, {name}": make(env, n_steps) for (name, make), env in zip(makers.items(), envs, strict=True)
+        }
+        samples = report.measure("workers", {**loops, f"{kind}, bare": bare})
+        bare.close()
         for env in envs:
             env.close()
-        shares.update({name: spread([v / best for v in speeds(samples[name], "wall")]) for name in loops})
+        shares.update({name: spread([v / best for v in speeds(samples[name], "wall")]) for name in samples})
     for name, share in shares.items():
         key = "workers_" + name.replace(", ", "_")
         report.add_ratio(key, share, f"steps per wall second / {ideal[name.split(',')[0]]:,.0f}, the ideal ({name})")

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 
 from benchmarks import bench, gpu, heavy, stacked
-from benchmarks.measure import Sample, alternate, ratio, spread
+from benchmarks.measure import Sample, alternate, cores, ratio, spread
 from benchmarks.report import BARS, Report
 
 AGENT_STEPS = 32
@@ -45,6 +45,9 @@ def test_steps_are_counted_as_they_were_done(written):
     assert junction_rows == [[4 * 8]] * 2
     together = [steps for (part, _), steps in rows.items() if part == "together"]
     assert together == [[8 * 8]] * 4 + [[4 * 8]] * 4
+    if cores() > 1:
+        assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [4 * 8]
+        assert rows["cores", "2 teams"] == [2 * 4 * 8]
     for n in (5, 20):
         for kind in ("fixed others", "all learn", "no belief"):
             assert rows["agents", f"{n} agents, {kind}"] == [n * AGENT_STEPS]
@@ -134,4 +137,6 @@ def test_memory_and_workers_are_measured(tmp_path):
     assert all(value > 50 for value in written["peak_mib"].values())
     assert written["ratios"]["workers_vs_ideal"] > 0
     steps = {row["name"]: row["steps"] for row in written["details"]["rows"]}
-    assert steps["burns, stepped"] == steps["sleeps, learning"] == [2 * 4]
+    assert steps["burns, stepped"] == steps["sleeps, learning"] == steps["sleeps, bare"] == [2 * 4]
+    # Nobody takes less time than it takes
+    assert written["details"]["ratios"]["workers_sleeps_bare"]["median"] < 1

@@ -76,7 +76,9 @@ class _Attend(th.autograd.Function):
     def forward(
         ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        weights = _products(queries, keys, kept).softmax(dim=-1)
+        # Also for the backward pass: to make it takes half as long as the products
+        ctx.wanted = _wanted(kept, len(keys), queries.dtype)
+        weights = _products(queries, keys, ctx.wanted).softmax(dim=-1)
         ctx.save_for_backward(queries, keys, values, kept, weights)
         ctx.mark_non_differentiable(weights)
         return _sums(values, kept, weights), weights
@@ -85,20 +87,23 @@ class _Attend(th.autograd.Function):
     def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
         queries, keys, values, kept, weights = ctx.saved_tensors
         grad_means = grad_outputs[0]
-        grad_weights = _products(grad_means, values, kept)
+        grad_weights = _products(grad_means, values, ctx.wanted)
         grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True))
         by_row = _ByRow(kept, len(keys))
         grad_keys, grad_values = by_row.sums(queries, grad_scores), by_row.sums(grad_means, weights)
         return _sums(keys, kept, grad_scores), grad_keys, grad_values, None
 
 
-def _products(queries: th.Tensor, rows: th.Tensor, kept: th.Tensor) -> th.Tensor:
-    """Products of each query with its kept rows, ``[B, N]``."""
+def _wanted(kept: th.Tensor, n_rows: int, dtype: th.dtype) -> th.Tensor:
+    """A sparse ``[B, T]`` of zeros at the kept rows of each query."""
     starts = th.arange(0, kept.numel() + 1, kept.shape[1], dtype=kept.dtype, device=kept.device)
-    wanted = th.sparse_csr_tensor(
-        starts, kept.flatten(), queries.new_zeros(kept.numel()), size=(len(queries), len(rows)), check_invariants=False
-    )
-    return th.sparse.sampled_addmm(wanted, queries, rows.T).values().view(kept.shape)
+    zeros = th.zeros(kept.numel(), dtype=dtype, device=kept.device)
+    return th.sparse_csr_tensor(starts, kept.flatten(), zeros, size=(len(kept), n_rows), check_invariants=False)
+
+
+def _products(queries: th.Tensor, rows: th.Tensor, wanted: th.Tensor) -> th.Tensor:
+    """Products of each query with its wanted rows, ``[B, N]``."""
+    return th.sparse.sampled_addmm(wanted, queries, rows.T).values().view(len(queries), -1)
 
 
 def _sums(rows: th.Tensor, kept: th.Tensor, weights: th.Tensor) -> th.Tensor:
@@ -118,12 +123,14 @@ class _ByRow:
         # On a CPU numpy's sort of short integers takes a tenth of PyTorch's time
         if kept.device.type == "cpu":
             rows = kept.numpy().ravel().astype(np.uint16 if n_rows <= 2**16 else np.int32)
-            self._order = th.from_numpy(rows.argsort(kind="stable"))
+            order = rows.argsort(kind="stable")
+            # Nor is PyTorch quick to divide whole numbers
+            self._order, self._queries = th.from_numpy(order), th.from_numpy(order // kept.shape[1]).int()
             counts = th.from_numpy(np.bincount(rows, minlength=n_rows))
         else:
             self._order = kept.flatten().argsort(stable=True)
+            self._queries = (self._order // kept.shape[1]).int()
             counts = kept.flatten().bincount(minlength=n_rows)
-        self._queries = (self._order // kept.shape[1]).int()
         self._starts = (counts.cumsum(0) - counts).int()
 
     def sums(self, queries: th.Tensor, weights: th.Tensor) -> th.Tensor:
