@@ -10,7 +10,7 @@ Parts:
   by hand, the same as a team, BeliefPPO without a belief (ippo) and with the paper's
 - ``b``: ten learners on Traffic Junction (medium), 32 copies, the settings of zoo_configs/belief_ppo.yml
 - ``c``: eight learners on SMAX's 3s5z, where jaxmarl is installed
-- ``together``: the teams of ``a`` and ``b`` as they are, whose policies act together, against each policy by itself
+- ``together``: the teams of ``a`` and ``b`` as they are, whose policies act together, and the same with each policy by itself
 - ``d``: growth with the number of agents, copies, remembered steps and others (benchmarks/growth.py)
 - ``e``: peak memory, each program in a process of its own
 - ``cores``: two cores against one
@@ -106,9 +106,10 @@ def together(report: Report) -> None:
     teams: dict[str, Callable[[str, bool], Team]] = {"spread": spread_team, "junction": junction_team}
     for name, make in teams.items():
         for algo in ALGOS:
+            # One team, which learns the same either way: where the tensors of another one lie makes a difference of a tenth
+            team = make(algo, report.quick)
             loops = {
-                f"{name}, {algo}, {how}": loop(make(algo, report.quick))
-                for how, loop in (("together", TeamLoop), ("each by itself", ApartLoop))
+                f"{name}, {algo}, {how}": loop(team) for how, loop in (("together", TeamLoop), ("each by itself", ApartLoop))
             }
             as_one, apart = report.measure("together", loops, warmup=2).values()
             what = f"{name}, team of {algo}: acting together / each by itself"

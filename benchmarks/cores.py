@@ -2,17 +2,22 @@
 Two cores against one: Traffic Junction's ten agents with a belief, side by side or one after the other.
 
 ``two_processes_vs_one`` is the control: two such teams, each in a process of its own and without a word between them, against
-one alone. A team cannot gain more from the two cores than that.
+one alone: a team cannot gain more from the two cores. Rollouts and updates are also timed apart, since they share out
+differently.
 """
 
+import time
 from multiprocessing.connection import Connection
+from typing import Any
+from unittest import mock
 
 import torch as th
 
-from benchmarks.measure import cores, ratio
+from benchmarks.measure import cores, ratio, spread
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop, junction_team
 from sb3_belief import Team
+from sb3_belief.team.lockstep import Lockstep
 from sb3_belief.team.processes import start_context
 
 _KEY, _CONTROL = "two_cores_vs_one", "two_processes_vs_one"
@@ -29,6 +34,30 @@ def largest_difference(a: Team, b: Team) -> float:
         pairs = zip(model.policy.parameters(), b.agents[agent].policy.parameters(), strict=True)
         differences += [float((first - second).abs().max()) for first, second in pairs]
     return max(differences)
+
+
+class _PhasesLoop(TeamLoop):
+    """Also notes how many seconds on the wall each of its rollouts and each update of all agents took."""
+
+    def __init__(self, team: Team) -> None:
+        super().__init__(team)
+        self.rollouts: list[float] = []
+        self.updates: list[float] = []
+
+    def __call__(self) -> int:
+        end_rollouts, seconds = Lockstep._end_rollouts, []
+
+        def timed(*args: Any) -> None:
+            start = time.perf_counter()
+            end_rollouts(*args)
+            seconds.append(time.perf_counter() - start)
+
+        start = time.perf_counter()
+        with mock.patch.object(Lockstep, "_end_rollouts", timed):
+            steps = super().__call__()
+        self.updates.append(sum(seconds))
+        self.rollouts.append(time.perf_counter() - start - sum(seconds))
+        return steps
 
 
 class _TwoTeams:
@@ -67,6 +96,10 @@ def _learn_when_told(connection: Connection, quick: bool) -> None:
         pass
 
 
+def _median(seconds: list[float]) -> str:
+    return f"{spread(seconds).median:.2f} s"
+
+
 def run(report: Report) -> None:
     """
     :param report: what is found goes there
@@ -75,12 +108,19 @@ def run(report: Report) -> None:
     if cores() < 2:
         report.skip(_KEY, "there is one core only")
         return
-    loops = {f"{n} job{'s' * (n > 1)}": TeamLoop(junction_team("belief_ppo", report.quick, jobs=n)) for n in (1, 2)}
+    loops = {f"{n} job{'s' * (n > 1)}": _PhasesLoop(junction_team("belief_ppo", report.quick, jobs=n)) for n in (1, 2)}
     one, two = loops.values()
     teams = _TwoTeams(report.quick)
     samples = report.measure("cores", {**loops, "2 teams": teams})
     teams.end()
     report.add_ratio(_KEY, ratio(samples["2 jobs"], samples["1 job"], "wall"), "wall speed with two jobs / one")
+    for phase in ("rollouts", "updates"):
+        # Without those that warmed up
+        seconds = [getattr(loop, phase)[-report.rounds :] for loop in (one, two)]
+        found = spread([a / b for a, b in zip(*seconds, strict=True)])
+        report.add_ratio(
+            f"{_KEY}_{phase}", found, f"the same of {phase} alone, {_median(seconds[0])} and {_median(seconds[1])}"
+        )
     control = ratio(samples["2 teams"], samples["1 job"], "wall")
     report.add_ratio(_CONTROL, control, "wall speed of two teams in processes of their own / one alone")
     with th.no_grad():

@@ -214,6 +214,8 @@ class Lockstep:
         streams.to(stream)
         observer.on_rollout_start()
         while learning:
+            # Who acts in another process has its step first, so that the process is busy while others here have theirs
+            learning.sort(key=lambda agent: members[agent].state != ACTS_ELSEWHERE)
             self._await_actions(streams)
             all_together = len(learning) == len(members)
             if not all_together:

@@ -124,8 +124,8 @@ class ActsElsewhere:
 
 class ActsHere:
     """
-    The same for a policy that acts in this process: when the passes of others have been sent, all at once, and together with
-    others in this process.
+    The same for a policy that acts in this process: when the passes of others have been sent, and together with others in this
+    process.
 
     :param hub: in which its agent learns
     :param agent: whose policy it is
@@ -144,6 +144,8 @@ class ActsHere:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         if not self._hub.chooses_actions(self._agent):
             return _own_forward(self._policy)(*args, **kwargs)
+        # The hub lets agents that act elsewhere go first, so all of theirs are posted by now
+        self._workers.flush()
         if self._rollout != self._hub.n_rounds:
             # Others' weights, and it may have other networks
             self._part, self._rollout = Part(self._policy), self._hub.n_rounds

@@ -118,11 +118,11 @@ class _Before:
                     yield (path, name), value
 
     def _fingerprints(self) -> dict[tuple[str, str], Any]:
-        return {
-            key: value if type(value) in _PLAIN else self._fingerprint(value)
-            for key, value in self._values()
-            if id(value) not in self._known
-        }
+        values = [(key, value) for key, value in self._values() if id(value) not in self._known]
+        # A policy has its model's spaces, so once for each object
+        objects = {id(value): value for _, value in values if type(value) not in _PLAIN}
+        prints = {number: self._fingerprint(value) for number, value in objects.items()}
+        return {key: prints.get(id(value), value) for key, value in values}
 
     def _fingerprint(self, value: Any) -> tuple[bytes, list[bytes]]:
         head, buffers = dumps(value, self._known)
