@@ -10,7 +10,8 @@ Parts:
   by hand, the same as a team, BeliefPPO without a belief (ippo) and with the paper's
 - ``b``: ten learners on Traffic Junction (medium), 32 copies, the settings of zoo_configs/belief_ppo.yml
 - ``c``: eight learners on SMAX's 3s5z, where jaxmarl is installed
-- ``together``: the teams of ``a`` and ``b`` as they are, whose policies act together, and the same with each policy by itself
+- ``together``: the teams of ``a`` and ``b`` as they are, whose policies act together, against each policy by itself
+  (benchmarks/acting.py)
 - ``d``: growth with the number of agents, copies, remembered steps and others (benchmarks/growth.py)
 - ``e``: peak memory, each program in a process of its own
 - ``cores``: two cores against one
@@ -27,13 +28,12 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import breakdown, cores, gpu, growth, heavy, memory
+from benchmarks import acting, breakdown, cores, gpu, growth, heavy, memory
 from benchmarks.measure import Loop, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
     ALGOS,
     SPREAD_ENVS,
-    ApartLoop,
     TeamLoop,
     has_smax,
     junction_team,
@@ -41,7 +41,6 @@ from benchmarks.teams import (
     spread_settings,
     spread_team,
 )
-from sb3_belief import Team
 
 OUT = Path(__file__).resolve().parent / "out" / "bench.json"
 
@@ -98,29 +97,11 @@ def smax(report: Report) -> None:
     breakdown.compare(report, "c", {algo: smax_team(algo, report.quick) for algo in ALGOS})
 
 
-def together(report: Report) -> None:
-    """
-    :param report: what is found goes there
-    """
-    report.title("together", "policies that act together against each by itself")
-    teams: dict[str, Callable[[str, bool], Team]] = {"spread": spread_team, "junction": junction_team}
-    for name, make in teams.items():
-        for algo in ALGOS:
-            # One team, which learns the same either way: where the tensors of another one lie makes a difference of a tenth
-            team = make(algo, report.quick)
-            loops = {
-                f"{name}, {algo}, {how}": loop(team) for how, loop in (("together", TeamLoop), ("each by itself", ApartLoop))
-            }
-            as_one, apart = report.measure("together", loops, warmup=2).values()
-            what = f"{name}, team of {algo}: acting together / each by itself"
-            report.add_ratio(f"together_vs_apart_{name}_{algo}", ratio(as_one, apart), what)
-
-
 PARTS: dict[str, Callable[[Report], None]] = {
     "a": spread,
     "b": junction,
     "c": smax,
-    "together": together,
+    "together": acting.run,
     "d": growth.run,
     "e": memory.run,
     "cores": cores.run,

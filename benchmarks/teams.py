@@ -2,12 +2,10 @@
 
 import importlib.util
 from typing import Any
-from unittest import mock
 
 from stable_baselines3 import PPO
 
 from sb3_belief import BeliefPPO, Team, make_team_env
-from sb3_belief.team.stacking import passes
 from sb3_belief.zoo.config import RunConfig, load_config
 
 #: The beliefs that are compared; "ippo" is BeliefPPO without one
@@ -96,11 +94,3 @@ class TeamLoop:
         before = self.team.num_timesteps
         self.team.learn(self._total, reset_num_timesteps=False)
         return self.team.num_timesteps - before
-
-
-class ApartLoop(TeamLoop):
-    """The same, where no policies act together: each makes its own passes."""
-
-    def __call__(self) -> int:
-        with mock.patch.object(passes, "signature", lambda policy: None):
-            return super().__call__()

@@ -10,8 +10,9 @@ SB3's ``learn()`` owns its environment loop, so each runs in a coroutine (a gree
    what its algorithm does with the step (store it, at times train and log) and chooses its next action.
 
 So whoever stops the training, all stop after the same step, and nobody has trained on a step that others have not seen. There
-is one thread and one order, the team's: runs are deterministic. Every agent draws from a random stream of its own
-(``RandomStream``), and so does what runs in the hub: the environment in this process and the team's callbacks.
+is one thread and one order: the team's, with those that act in another process first. So runs are deterministic. Every
+agent draws from a random stream of its own (``RandomStream``), and so does what runs in the hub: the environment in this
+process and the team's callbacks.
 """
 
 import contextvars

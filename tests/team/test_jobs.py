@@ -22,6 +22,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.team.jobs.workers import Workers
+from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.team.members import ACTS_HERE
 from sb3_belief.zoo.cli import train_main
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import ToyEnv
@@ -231,6 +233,44 @@ def test_who_acts_elsewhere(case, passes):
         assert (passes[in_worker], passes[here]) == (expected if jobs == 2 else 0, 0)
         assert all("forward" not in vars(model.policy) for model in team.agents.values())
     assert results[0] == results[1]
+
+
+def test_workers_are_asked_before_others_prepare_to_act(monkeypatch):
+    # Of each joint step: who asked for a pass elsewhere, what was sent, who is ready to act here
+    steps: list[list[Any]] = [[]]
+    joint_step, send, post, wait = Lockstep._step, Workers._send, Workers.post, Lockstep.wait
+
+    def new_step(self, actions):
+        steps.append([])
+        return joint_step(self, actions)
+
+    def note_send(self, number, agent, content):
+        if agent is None:
+            steps[-1].append(("sent", *content))
+        send(self, number, agent, content)
+
+    def note_post(self, number, agent, job):
+        steps[-1].append(("asks", agent))
+        post(self, number, agent, job)
+
+    def note_wait(self, agent, state):
+        if state == ACTS_HERE:
+            steps[-1].append(("ready", agent))
+        wait(self, agent, state)
+
+    monkeypatch.setattr(Lockstep, "_step", new_step)
+    monkeypatch.setattr(Lockstep, "wait", note_wait)
+    monkeypatch.setattr(Workers, "_send", note_send)
+    monkeypatch.setattr(Workers, "post", note_post)
+    team = toy_team(PPO, 2, EASY, n_steps=8, batch_size=8, n_epochs=1)
+    team.learn(16 * 3)
+    first, second, third, fourth, fifth = team.possible_agents
+    asks = [("asks", agent) for agent in (first, third, fifth)]
+    ready = [("ready", agent) for agent in (second, fourth)]
+    # From the second step after the first update on, and without those that follow an update or end the learning
+    within = [step for i, step in enumerate(steps) if i > 8 and i % 8]
+    assert len(within) == 14
+    assert all(step == [*asks, ("sent", first, third, fifth), *ready] for step in within)
 
 
 def test_a_copy_of_a_policy_acts_by_itself():

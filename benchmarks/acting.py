@@ -1,0 +1,107 @@
+"""
+Do policies of equal shape act faster together than each by itself?
+
+One team does both in turn, from one joint step to the next: it learns the same either way, and where the tensors of another
+team lie makes more of a difference than is to be measured. Timed is all that lies between two steps of the environment.
+"""
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+from benchmarks.measure import Sample, Spread, spread
+from benchmarks.report import Report
+from benchmarks.teams import ALGOS, TeamLoop, junction_team, spread_team
+from sb3_belief import Team
+from sb3_belief.team.jobs.acting import ActsHere
+from sb3_belief.team.lockstep import Lockstep
+
+TOGETHER, APART = "together", "each by itself"
+
+
+class TurnsLoop(TeamLoop):
+    """
+    Rollouts whose joint steps are acted in together and apart by turns.
+
+    :param team: what learns
+    """
+
+    def __init__(self, team: Team) -> None:
+        super().__init__(team)
+        self._way = TOGETHER
+        #: Of each rollout: {way: what lay between one step of the environment and the next}
+        self.rollouts: list[dict[str, list[Sample]]] = []
+
+    def __call__(self) -> int:
+        step, end_rollouts, act = Lockstep._step, Lockstep._end_rollouts, ActsHere.__call__
+        samples: dict[str, list[Sample]] = defaultdict(list)
+        # When the last step of the environment was done; None after an update, whose time is not to be counted
+        since: tuple[float, float] | None = None
+
+        def now() -> tuple[float, float]:
+            return time.process_time(), time.perf_counter()
+
+        def timed_step(hub: Lockstep, actions: Any) -> Any:
+            nonlocal since
+            if since is not None:
+                cpu, wall = now()
+                samples[self._way].append(Sample(hub.num_envs, cpu - since[0], wall - since[1]))
+            result = step(hub, actions)
+            self._way = APART if self._way == TOGETHER else TOGETHER
+            since = now()
+            return result
+
+        def untimed_end(hub: Lockstep, *args: Any) -> None:
+            nonlocal since
+            end_rollouts(hub, *args)
+            since = None
+
+        def act_so(here: ActsHere, *args: Any, **kwargs: Any) -> Any:
+            if self._way == TOGETHER:
+                return act(here, *args, **kwargs)
+            return type(here._policy).forward(here._policy, *args, **kwargs)
+
+        with (
+            mock.patch.object(Lockstep, "_step", timed_step),
+            mock.patch.object(Lockstep, "_end_rollouts", untimed_end),
+            mock.patch.object(ActsHere, "__call__", act_so),
+        ):
+            steps = super().__call__()
+        self.rollouts.append(dict(samples))
+        # So that each way comes first as often as the other
+        self._way = APART if self._way == TOGETHER else TOGETHER
+        return steps
+
+    def gain(self, n_rollouts: int) -> Spread:
+        """
+        :param n_rollouts: the last ones, which count
+        :return: time of a step apart over that of one together, in the medians of each rollout
+        """
+        medians = [
+            [statistics.median(sample.cpu for sample in rollout[way]) for way in (APART, TOGETHER)]
+            for rollout in self.rollouts[-n_rollouts:]
+        ]
+        return spread([apart / together for apart, together in medians])
+
+
+def run(report: Report) -> None:
+    """
+    :param report: what is found goes there
+    """
+    report.title("together", "policies that act together against each by itself, without environment and updates")
+    teams: dict[str, Callable[[str, bool], Team]] = {"spread": spread_team, "junction": junction_team}
+    for name, make in teams.items():
+        for algo in ALGOS:
+            loop = TurnsLoop(make(algo, report.quick))
+            for _ in range(report.rounds if report.quick else 2 + report.rounds):
+                loop()
+            samples = {
+                f"{name}, {algo}, {way}": [sample for rollout in loop.rollouts[-report.rounds :] for sample in rollout[way]]
+                for way in (TOGETHER, APART)
+            }
+            report.add_samples("together", samples, "joint steps")
+            what = f"{name}, team of {algo}: time of acting each by itself / together"
+            report.add_ratio(f"together_vs_apart_{name}_{algo}", loop.gain(report.rounds), what)
