@@ -76,7 +76,7 @@ class _Attend(th.autograd.Function):
     def forward(
         ctx: Any, queries: th.Tensor, keys: th.Tensor, values: th.Tensor, kept: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        # Also for the backward pass: to make it takes half as long as the products
+        # Kept for the backward pass, which needs products at the same places
         ctx.wanted = _wanted(kept, len(keys), queries.dtype)
         weights = _products(queries, keys, ctx.wanted).softmax(dim=-1)
         ctx.save_for_backward(queries, keys, values, kept, weights)
