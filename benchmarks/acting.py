@@ -1,8 +1,8 @@
 """
 Do policies of equal shape act faster together than each by itself?
 
-One team does both in turn, from one joint step to the next: it learns the same either way, and where the tensors of another
-team lie makes more of a difference than is to be measured. Timed is all that lies between two steps of the environment.
+One team does both in turn, from one joint step to the next, which it can since it learns the same either way: so nothing else
+differs, as it would between two teams. Timed is all that lies between two steps of the environment.
 """
 
 import statistics
