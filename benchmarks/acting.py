@@ -5,6 +5,7 @@ One team does both in turn, from one joint step to the next, which it can since 
 differs, as it would between two teams. Timed is all that lies between two steps of the environment.
 """
 
+import itertools
 import statistics
 import time
 from collections import defaultdict
@@ -16,7 +17,6 @@ from benchmarks.measure import Sample, Spread, spread
 from benchmarks.report import Report
 from benchmarks.teams import ALGOS, TeamLoop, junction_team, spread_team
 from sb3_belief import Team
-from sb3_belief.team.jobs.acting import ActsHere
 from sb3_belief.team.lockstep import Lockstep
 
 TOGETHER, APART = "together", "each by itself"
@@ -31,12 +31,13 @@ class TurnsLoop(TeamLoop):
 
     def __init__(self, team: Team) -> None:
         super().__init__(team)
-        self._way = TOGETHER
+        self._ways = itertools.cycle((TOGETHER, APART))
+        self._way = next(self._ways)
         #: Of each rollout: {way: what lay between one step of the environment and the next}
         self.rollouts: list[dict[str, list[Sample]]] = []
 
     def __call__(self) -> int:
-        step, end_rollouts, act = Lockstep._step, Lockstep._end_rollouts, ActsHere.__call__
+        step, end_rollouts, chooses_actions = Lockstep._step, Lockstep._end_rollouts, Lockstep.chooses_actions
         samples: dict[str, list[Sample]] = defaultdict(list)
         # When the last step of the environment was done; None after an update, whose time is not to be counted
         since: tuple[float, float] | None = None
@@ -50,7 +51,7 @@ class TurnsLoop(TeamLoop):
                 cpu, wall = now()
                 samples[self._way].append(Sample(hub.num_envs, cpu - since[0], wall - since[1]))
             result = step(hub, actions)
-            self._way = APART if self._way == TOGETHER else TOGETHER
+            self._way = next(self._ways)
             since = now()
             return result
 
@@ -59,20 +60,19 @@ class TurnsLoop(TeamLoop):
             end_rollouts(hub, *args)
             since = None
 
-        def act_so(here: ActsHere, *args: Any, **kwargs: Any) -> Any:
-            if self._way == TOGETHER:
-                return act(here, *args, **kwargs)
-            return type(here._policy).forward(here._policy, *args, **kwargs)
+        # A policy that cannot wait for others acts by itself
+        def can_wait(hub: Lockstep, agent: str) -> bool:
+            return self._way == TOGETHER and chooses_actions(hub, agent)
 
         with (
             mock.patch.object(Lockstep, "_step", timed_step),
             mock.patch.object(Lockstep, "_end_rollouts", untimed_end),
-            mock.patch.object(ActsHere, "__call__", act_so),
+            mock.patch.object(Lockstep, "chooses_actions", can_wait),
         ):
             steps = super().__call__()
         self.rollouts.append(dict(samples))
         # So that each way comes first as often as the other
-        self._way = APART if self._way == TOGETHER else TOGETHER
+        self._way = next(self._ways)
         return steps
 
     def gain(self, n_rollouts: int) -> Spread:

@@ -6,8 +6,8 @@ one alone: a team cannot gain more from the two cores. Rollouts and updates are 
 differently.
 """
 
+import statistics
 import time
-from multiprocessing.connection import Connection
 from typing import Any
 from unittest import mock
 
@@ -16,9 +16,9 @@ import torch as th
 from benchmarks.measure import cores, ratio, spread
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop, junction_team
+from benchmarks.told import Told
 from sb3_belief import Team
 from sb3_belief.team.lockstep import Lockstep
-from sb3_belief.team.processes import start_context
 
 _KEY, _CONTROL = "two_cores_vs_one", "two_processes_vs_one"
 
@@ -60,44 +60,9 @@ class _PhasesLoop(TeamLoop):
         return steps
 
 
-class _TwoTeams:
-    """
-    A team in this process and another in one of its own, which learn at the same time.
-
-    :param quick: see ``junction_team``
-    """
-
-    def __init__(self, quick: bool) -> None:
-        context = start_context()
-        self._other, there = context.Pipe()
-        self._process = context.Process(target=_learn_when_told, args=(there, quick), daemon=True)
-        self._process.start()
-        there.close()
-        self._own = TeamLoop(junction_team("belief_ppo", quick))
-
-    def __call__(self) -> int:
-        self._other.send(None)
-        return self._own() + self._other.recv()
-
-    def end(self) -> None:
-        """End the other process."""
-        self._other.close()
-        self._process.join()
-
-
-def _learn_when_told(connection: Connection, quick: bool) -> None:
+def _learner(quick: bool) -> TeamLoop:
     th.set_num_threads(1)
-    loop = TeamLoop(junction_team("belief_ppo", quick))
-    try:
-        while True:
-            connection.recv()
-            connection.send(loop())
-    except EOFError:
-        pass
-
-
-def _median(seconds: list[float]) -> str:
-    return f"{spread(seconds).median:.2f} s"
+    return TeamLoop(junction_team("belief_ppo", quick))
 
 
 def run(report: Report) -> None:
@@ -110,17 +75,21 @@ def run(report: Report) -> None:
         return
     loops = {f"{n} job{'s' * (n > 1)}": _PhasesLoop(junction_team("belief_ppo", report.quick, jobs=n)) for n in (1, 2)}
     one, two = loops.values()
-    teams = _TwoTeams(report.quick)
-    samples = report.measure("cores", {**loops, "2 teams": teams})
-    teams.end()
+    here, there = _learner(report.quick), Told(_learner, report.quick)
+
+    def two_teams() -> int:
+        there.tell()
+        return here() + there.steps()
+
+    samples = report.measure("cores", {**loops, "2 teams": two_teams})
+    there.end()
     report.add_ratio(_KEY, ratio(samples["2 jobs"], samples["1 job"], "wall"), "wall speed with two jobs / one")
     for phase in ("rollouts", "updates"):
         # Without those that warmed up
         seconds = [getattr(loop, phase)[-report.rounds :] for loop in (one, two)]
         found = spread([a / b for a, b in zip(*seconds, strict=True)])
-        report.add_ratio(
-            f"{_KEY}_{phase}", found, f"the same of {phase} alone, {_median(seconds[0])} and {_median(seconds[1])}"
-        )
+        medians = " and ".join(f"{statistics.median(each):.2f} s" for each in seconds)
+        report.add_ratio(f"{_KEY}_{phase}", found, f"the same of {phase} alone, {medians}")
     control = ratio(samples["2 teams"], samples["1 job"], "wall")
     report.add_ratio(_CONTROL, control, "wall speed of two teams in processes of their own / one alone")
     with th.no_grad():

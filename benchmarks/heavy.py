@@ -11,7 +11,6 @@ told, which is the most that could be reached.
 import time
 from collections.abc import Callable
 from functools import partial
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,9 @@ from stable_baselines3 import PPO
 from benchmarks.measure import Loop, Spread, cores, speeds, spread
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop
+from benchmarks.told import Told
 from sb3_belief import Team, make_team_env
 from sb3_belief.team import TeamVecEnv
-from sb3_belief.team.processes import start_context
 
 SECONDS, COPIES, EPISODE = 0.01, 8, 25
 
@@ -98,41 +97,31 @@ class _Steps:
 
 
 class _Bare:
-    """Processes that only let the time pass, behind pipes: the control."""
+    """Processes that only let the time pass: the control."""
 
     def __init__(self, kind: str, copies: int, n_steps: int) -> None:
-        context = start_context()
-        self._n_steps = n_steps
-        pipes = [context.Pipe() for _ in range(copies)]
-        self._connections = [here for here, _ in pipes]
-        self._processes = [context.Process(target=_pass_time_when_told, args=(there, kind), daemon=True) for _, there in pipes]
-        for process, (_, there) in zip(self._processes, pipes, strict=True):
-            process.start()
-            there.close()
+        self._copies, self._n_steps = [Told(_step_bare, kind) for _ in range(copies)], n_steps
 
     def __call__(self) -> int:
+        steps = 0
         for _ in range(self._n_steps):
-            for connection in self._connections:
-                connection.send_bytes(b"s")
-            for connection in self._connections:
-                connection.recv_bytes()
-        return self._n_steps * len(self._connections)
+            for copy in self._copies:
+                copy.tell()
+            steps += sum(copy.steps() for copy in self._copies)
+        return steps
 
     def close(self) -> None:
         """End the processes."""
-        for connection, process in zip(self._connections, self._processes, strict=True):
-            connection.close()
-            process.join()
+        for copy in self._copies:
+            copy.end()
 
 
-def _pass_time_when_told(connection: Connection, kind: str) -> None:
-    try:
-        while True:
-            connection.recv_bytes()
-            pass_time(kind)
-            connection.send_bytes(b"s")
-    except EOFError:
-        pass
+def _step_bare(kind: str) -> Loop:
+    def step() -> int:
+        pass_time(kind)
+        return 1
+
+    return step
 
 
 def _learner(env: TeamVecEnv, n_steps: int) -> TeamLoop:

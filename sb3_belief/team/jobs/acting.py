@@ -144,7 +144,7 @@ class ActsHere:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         if not self._hub.chooses_actions(self._agent):
             return _own_forward(self._policy)(*args, **kwargs)
-        # The hub lets agents that act elsewhere go first, so all of theirs are posted by now
+        # The hub lets agents that act elsewhere go first, so but right after an update all of theirs are posted by now
         self._workers.flush()
         if self._rollout != self._hub.n_rounds:
             # Others' weights, and it may have other networks
