@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from sb3_belief.team.views import AgentStep
 
 if TYPE_CHECKING:
-    from sb3_belief.team.lockstep import Lockstep
+    from sb3_belief.team.hub import Hub
 
 
 class AgentVecEnv(VecEnv):
@@ -29,7 +29,7 @@ class AgentVecEnv(VecEnv):
     :param agent: name of the agent
     """
 
-    def __init__(self, hub: "Lockstep", agent: str):
+    def __init__(self, hub: "Hub", agent: str):
         self.agent = agent
         self._hub = hub
         self._actions = np.zeros(0)
@@ -71,7 +71,7 @@ class AgentVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         known: dict[str, Any] = {
-            "render_mode": self._hub.env.render_mode,
+            "render_mode": self._hub.render_mode,
             "others_action_spaces": dict(self._others_action_spaces),
         }
         masks = self._hub.masks
@@ -101,4 +101,4 @@ class AgentVecEnv(VecEnv):
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        return self._hub.env.get_images()
+        return self._hub.get_images()

@@ -12,14 +12,14 @@ from sb3_belief.team.streams import RandomStream
 from sb3_belief.team.vec_env import TeamObs, TeamStep
 
 if TYPE_CHECKING:
-    from sb3_belief.team.lockstep import Lockstep
+    from sb3_belief.team.hub import Hub
 
 # Why an agent's coroutine has switched to the hub
 ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
 # With updates in several processes: it is to be updated in this one, or waits for the others to be
 UPDATES_HERE, UPDATES = "updates here", "updates"
-# The same for its next action; also with one process, where policies act together
-ACTS_HERE, ACTS_ELSEWHERE = "acts here", "acts elsewhere"
+# It is ready to choose its next action together with others
+ACTS_HERE = "acts here"
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Barrier(CallbackList):
     What runs at every step is written out: where there is no callback, SB3's own bookkeeping for one would be waste.
     """
 
-    def __init__(self, hub: "Lockstep", agent: str, callback: BaseCallback | None):
+    def __init__(self, hub: "Hub", agent: str, callback: BaseCallback | None):
         super().__init__([] if callback is None else [callback])
         self._hub, self._agent = hub, agent
 

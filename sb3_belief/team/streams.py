@@ -42,6 +42,12 @@ class RandomStream:
         if th.cuda.is_initialized():
             self._cuda = th.cuda.get_rng_state_all()
 
+    def become(self, other: "RandomStream") -> None:
+        """
+        :param other: where this one is from now on; neither is the current one
+        """
+        self._torch, self._numpy = other._torch, other._numpy
+
 
 class StreamSwitch:
     """

@@ -111,7 +111,6 @@ class Team:
         self._hub = hub
         self._roster = roster
         self._scripted = scripted
-        self.agents: dict[str, BaseAlgorithm] = roster.models
         self.possible_agents = list(roster.models)
         self.seed = seed
         self.normalize = normalize
@@ -123,11 +122,20 @@ class Team:
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
         self._stream = team_stream(seed)
-        self._jobs = Jobs(roster.models, jobs)
+        self._jobs = Jobs(roster.models, roster.streams, jobs)
         self._learning = False
         # False when the agents' last observations are not all those of where the environment is now
         self._can_continue = False
         self._start_time, self._start_timesteps, self._iterations = 0, 0, 0
+
+    @property
+    def agents(self) -> dict[str, BaseAlgorithm]:
+        """
+        :return: {agent: its model}. While the team learns with several ``jobs``, models are up to date when they are asked for
+            here, not for who has kept them
+        """
+        self._jobs.look()
+        return self._roster.models
 
     @property
     def observation_space(self) -> spaces.Dict:
@@ -136,14 +144,14 @@ class Team:
         """
         if self._hub is not None:
             return spaces.Dict(self._hub.observation_spaces)
-        return spaces.Dict({agent: model.observation_space for agent, model in self.agents.items()})
+        return spaces.Dict({agent: model.observation_space for agent, model in self._roster.models.items()})
 
     @property
     def action_space(self) -> spaces.Dict:
         """
         :return: the agents' action spaces by agent
         """
-        return spaces.Dict({agent: model.action_space for agent, model in self.agents.items()})
+        return spaces.Dict({agent: model.action_space for agent, model in self._roster.models.items()})
 
     @property
     def logger(self) -> Logger:
@@ -203,9 +211,15 @@ class Team:
                 self.ep_success_buffer.clear()
             self._start_time, self._start_timesteps = time.time_ns(), self.num_timesteps
             log = self._make_log()
+            learn = partial(
+                _learn,
+                total_timesteps=total_timesteps,
+                log_interval=log_interval,
+                reset_num_timesteps=reset_num_timesteps,
+            )
             members = {
                 agent: Member(
-                    learn=partial(_learn, model, total_timesteps, log_interval, reset_num_timesteps),
+                    learn=partial(learn, model),
                     act=self._roster.actor(agent).go_on,
                     stream=self._roster.streams[agent],
                     callback=as_callback(own_callbacks[agent]) if own_callbacks.get(agent) is not None else None,
@@ -214,7 +228,8 @@ class Team:
             }
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
-            progress = TeamProgress(self, as_callback(callback, progress_bar), log)
+            team_callback = as_callback(callback, progress_bar)
+            progress = TeamProgress(self, team_callback, log)
             with StreamSwitch(self._stream):
                 if fresh:
                     for model in self.agents.values():
@@ -222,8 +237,8 @@ class Team:
                     hub.reset()
                 total = total_timesteps + self.num_timesteps
                 progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": hub.env})
-            with self._jobs.shared_out(hub):
-                in_step = hub.run(members, progress, self._stream)
+            with self._jobs.shared_out(hub, members, learn, team_callback) as branches:
+                in_step = hub.run(members, progress, self._stream, branches)
             with StreamSwitch(self._stream):
                 progress.on_training_end()
             self._can_continue = in_step
@@ -254,6 +269,7 @@ class Team:
             raise ValueError(f"No observation for {missing}; a team predicts from {{agent: observation}} of all its agents.")
         if action_masks is not None and not isinstance(action_masks, Mapping):
             action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
+        self._jobs.look()
         actions: TeamObs = {}
         states: dict[str, PolicyState] = {}
         for agent in self.possible_agents:
@@ -386,7 +402,7 @@ class Team:
 
 
 def _learn(
-    model: BaseAlgorithm, total_timesteps: int, log_interval: int | None, reset_num_timesteps: bool, callback: BaseCallback
+    model: BaseAlgorithm, callback: BaseCallback, total_timesteps: int, log_interval: int | None, reset_num_timesteps: bool
 ) -> None:
     # None is what SB3's loops take for "never", although they do not say so
     model.learn(

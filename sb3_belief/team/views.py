@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -11,6 +11,41 @@ from gymnasium import spaces
 from sb3_belief.team.vec_env import TeamObs, TeamStep
 
 AgentStep = tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+class AgentPart(NamedTuple):
+    """
+    What an agent is given of a joint step, as arrays.
+
+    :param obs: ``[num_envs, ...]``
+    :param rewards: float32 ``[num_envs]``
+    :param dones: bool ``[num_envs]``
+    :param others_actions: float32 ``[num_envs, W]``, zero where not visible
+    :param others_visible: bool ``[num_envs, n_others]``
+    :param active: bool ``[num_envs]``
+    :param ends: {copy in which it is done: what its info says besides}
+    """
+
+    obs: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+    others_actions: np.ndarray
+    others_visible: np.ndarray
+    active: np.ndarray
+    ends: dict[int, dict[str, Any]]
+
+    def as_step(self) -> AgentStep:
+        """
+        :return: observations, rewards, dones and infos, as a ``VecEnv`` returns them
+        """
+        infos: list[dict[str, Any]] = [
+            {"others_actions": others, "others_visible": seen, "active": is_active}
+            for others, seen, is_active in zip(self.others_actions, self.others_visible, self.active.tolist(), strict=True)
+        ]
+        for env_idx, end in self.ends.items():
+            infos[env_idx].update(end)
+        # Copies: SB3's on-policy algorithms add the bootstrapped value to the rewards in place
+        return self.obs, self.rewards.copy(), self.dones.copy(), infos
 
 
 def _component_sizes(space: spaces.Space) -> np.ndarray | None:
@@ -71,13 +106,21 @@ class TeamViews:
         # Places in visible[i, j], laid out flat
         self._seen = viewers * self._n_others + seen_rows
         bounds = np.concatenate([[0], np.cumsum([self._width - width for width in widths[:n_agents]])])
-        self._parts = [slice(start, stop) for start, stop in pairwise(bounds)]
+        self._others = [slice(start, stop) for start, stop in pairwise(bounds)]
 
     def split(self, actions: TeamObs, step: TeamStep) -> list[AgentStep]:
         """
+        :param actions: as for ``parts``
+        :param step: as for ``parts``
+        :return: each agent's step
+        """
+        return [part.as_step() for part in self.parts(actions, step)]
+
+    def parts(self, actions: TeamObs, step: TeamStep) -> list[AgentPart]:
+        """
         :param actions: {agent: array [num_envs, ...]} that led to the step
         :param step: what ``TeamVecEnv.step`` returned for them
-        :return: for each agent observations [num_envs, ...], rewards float32 [num_envs], dones bool [num_envs] and infos
+        :return: each agent's part
         :raises ValueError: if the infos say too little or too much of who saw whom, or of the scripted others
         """
         obs, _, team_dones, infos = step
@@ -94,29 +137,25 @@ class TeamViews:
         seen_actions = self._seen_actions(actions, visible, infos)
         any_done = bool(dones.any())
 
-        steps: list[AgentStep] = []
+        parts: list[AgentPart] = []
         for i, agent in enumerate(self._agents):
-            agent_infos: list[dict[str, Any]] = [
-                {"others_actions": others, "others_visible": seen, "active": is_active}
-                for others, seen, is_active in zip(
-                    seen_actions[:, self._parts[i]], visible[:, i], active[:, i].tolist(), strict=True
-                )
-            ]
-            if any_done:
-                for env_idx in np.flatnonzero(dones[:, i]):
-                    self._end(agent_infos[env_idx], i, obs[agent][env_idx], bool(cut[env_idx, i]), infos[env_idx])
-            # Copies: SB3's on-policy algorithms add the bootstrapped value to the rewards in place
-            steps.append((obs[agent], rewards[:, i].copy(), dones[:, i].copy(), agent_infos))
-        return steps
+            ends = {
+                int(env_idx): self._end(i, obs[agent][env_idx], bool(cut[env_idx, i]), infos[env_idx])
+                for env_idx in (np.flatnonzero(dones[:, i]) if any_done else ())
+            }
+            others = seen_actions[:, self._others[i]]
+            parts.append(AgentPart(obs[agent], rewards[:, i], dones[:, i], others, visible[:, i], active[:, i], ends))
+        return parts
 
-    def _end(self, agent_info: dict[str, Any], i: int, obs: np.ndarray, cut: bool, info: dict[str, Any]) -> None:
-        """Add what SB3 expects at a done; an agent whose own return ends before the team's has no reset between."""
-        agent_info["terminal_observation"] = info.get("terminal_observation", {}).get(self._agents[i], obs)
-        agent_info["TimeLimit.truncated"] = cut
+    def _end(self, i: int, obs: np.ndarray, cut: bool, info: dict[str, Any]) -> dict[str, Any]:
+        """What SB3 expects in an info at a done; an agent whose own return ends before the team's has no reset between."""
+        end = {"terminal_observation": info.get("terminal_observation", {}).get(self._agents[i], obs)}
+        end["TimeLimit.truncated"] = cut
         if "episode" in info:
-            agent_info["episode"] = {**info["episode"], "r": float(info["agent_episode_rewards"][i])}
+            end["episode"] = {**info["episode"], "r": float(info["agent_episode_rewards"][i])}
             if "is_success" in info:
-                agent_info["is_success"] = info["is_success"]
+                end["is_success"] = info["is_success"]
+        return end
 
     def _rows(self, key: str, shape: tuple[int, ...], infos: list[dict[str, Any]]) -> np.ndarray:
         """

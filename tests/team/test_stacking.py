@@ -13,8 +13,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy
-from sb3_belief.team.jobs.acting import Pass, do_passes
-from sb3_belief.team.stacking import Part, networks, passes
+from sb3_belief.team.stacking import networks, passes
+from sb3_belief.team.stacking.passes import Part
 from tests.team.helpers import Team, make_team_env
 from tests.team.test_jobs import Draws, OwnNetwork, Pushes, everything
 from tests.team.toy_envs import ToyEnv
@@ -213,31 +213,6 @@ def make_policies(n):
     for policy in policies:
         policy.remember(th.randn(60, 6).numpy(), np.eye(3, dtype=np.float32)[np.arange(60) % 3])
     return policies
-
-
-def test_passes_that_a_worker_makes_together(sizes):
-    th.manual_seed(0)
-    policies, obs = make_policies(3), th.randn(3, 8, 6)
-    jobs, expected = {}, {}
-    for i, policy in enumerate(policies):
-        th.manual_seed(i)
-        jobs[str(i)] = Pass((obs[i],), {"deterministic": True} if i == 2 else {}, th.get_rng_state().numpy())
-        with th.no_grad():
-            outputs = policy(obs[i], **jobs[str(i)].kwargs)
-        expected[str(i)] = [*outputs, *policy.acted_with, th.get_rng_state()]
-    done = do_passes({str(i): Part(policy) for i, policy in enumerate(policies)}, jobs)
-    assert sizes == [2]
-    for name, one in done.items():
-        assert one is not None
-        found = [*(sent.array for sent in one.outputs), *(sent.array for sent in one.acted_with), one.generator]
-        assert all(np.array_equal(a, b) for a, b in zip(found, expected[name], strict=True))
-
-
-def test_a_pass_that_fails_in_a_worker_is_left_to_the_team():
-    policies = make_policies(2)
-    generator = th.get_rng_state().numpy()
-    jobs = {"0": Pass((th.randn(8, 6),), {}, generator), "1": Pass((th.randn(8, 7),), {}, generator)}
-    assert do_passes({str(i): Part(policy) for i, policy in enumerate(policies)}, jobs) == {"0": None, "1": None}
 
 
 def test_a_policy_unlike_any_of_sb3_acts_by_itself():

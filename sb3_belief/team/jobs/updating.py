@@ -120,7 +120,6 @@ def _can_pickle(value: Any, known: dict[int, Any]) -> bool:
     return True
 
 
-@th.no_grad()
 def unpack_result(model: BaseAlgorithm, result: Message) -> None:
     """
     Make the model what it is after the update, and its random stream the current one.
@@ -131,20 +130,60 @@ def unpack_result(model: BaseAlgorithm, result: Message) -> None:
     """
     content = loads(result)
     if content["tensors"] is not None:
-        _write_tensors(model, content["tensors"])
-        _write_optimizers(model, content["optimizers"])
-        attributes = loads(content["attributes"], lambda path: _at(model, path))
-        for (path, name), value in attributes.items():
-            vars(_at(model, path))[name] = value
-        for path, name in content["removed"]:
-            del vars(_at(model, path))[name]
+        write_changes(model, content)
         write_stream(content["stream"])
+    show(content)
+    tell(model, content["log"])
+    raise_failure(content)
+
+
+@th.no_grad()
+def write_changes(model: BaseAlgorithm, changes: dict[str, Any]) -> None:
+    """
+    :param model: as it was before
+    :param changes: what has become different since then
+    """
+    _write_tensors(model, changes["tensors"])
+    _write_optimizers(model, changes["optimizers"])
+    attributes = loads(changes["attributes"], lambda path: _at(model, path))
+    for (path, name), value in attributes.items():
+        vars(_at(model, path))[name] = value
+    for path, name in changes["removed"]:
+        del vars(_at(model, path))[name]
+
+
+def write_buffer(model: BaseAlgorithm, content: Message) -> None:
+    """
+    :param model: whose rollout buffer it is
+    :param content: of the buffer
+    """
+    vars(model.rollout_buffer).update(loads(content, lambda path: _at(model, path)))  # type: ignore[attr-defined]
+
+
+def tell(model: BaseAlgorithm, log: list[tuple[str, tuple, dict[str, Any]]]) -> None:
+    """
+    :param model: to whose logger it goes
+    :param log: what was logged elsewhere
+    """
+    for method, args, kwargs in log:
+        getattr(model.logger, method)(*args, **kwargs)
+
+
+def show(content: dict[str, Any]) -> None:
+    """
+    :param content: with what was printed and warned elsewhere
+    """
     if content["output"]:
         sys.stdout.write(content["output"])
-    for method, args, kwargs in content["log"]:
-        getattr(model.logger, method)(*args, **kwargs)
     for message, category, filename, lineno in content["warnings"]:
         warnings.warn_explicit(message, category, filename, lineno, registry=_shown)
+
+
+def raise_failure(content: dict[str, Any]) -> None:
+    """
+    :param content: with what was raised elsewhere, if anything
+    :raises BaseException: this
+    """
     if content["error"] is not None:
         # As concurrent.futures shows where it happened
         raise content["error"] from _WorkerTraceback(content["traceback"])

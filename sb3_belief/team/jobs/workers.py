@@ -15,21 +15,19 @@ class _Worker(NamedTuple):
     :param process: itself
     :param connection: to it
     :param inbox: of that connection
-    :param waiting: agents whose jobs it has been given, in order
-    :param arrived: {agent: result that has been read before it was asked for}
-    :param posted: {agent: small job that is to be sent with others}
+    :param waiting: {whose job it has been given, see ``Workers.send``: who that is, in words}, in order
+    :param arrived: {whose: result that has been read before it was asked for}
     """
 
     process: Any
     connection: Connection
     inbox: Inbox
-    waiting: list[str]
-    arrived: dict[str, Any]
-    posted: dict[str, Any]
+    waiting: dict[str | None, str]
+    arrived: dict[str | None, Any]
 
 
 class Workers:
-    """Processes that update agents and choose their actions, ended with the last reference to this."""
+    """Processes in which agents learn or are updated, ended with the last reference to this."""
 
     def __init__(self) -> None:
         self._all: list[_Worker] = []
@@ -52,52 +50,31 @@ class Workers:
             process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
             process.start()
             there.close()
-            self._all.append(_Worker(process, here, Inbox(here, process), [], {}, {}))
+            self._all.append(_Worker(process, here, Inbox(here, process), {}, {}))
         return len(missing) > 0
 
-    def send(self, number: int, agent: str, job: Any) -> None:
+    def send(self, number: int, agent: str | None, job: Any, whose: str = "") -> None:
         """
         :param number: of the worker
-        :param agent: whose job it is; it has no other one at the time
+        :param agent: whose job it is; None: of the branch of the team that learns there
         :param job: to do after those it has
+        :param whose: who that is, if not an agent
         :raises RuntimeError: if the worker is dead
         """
-        self._all[number].waiting.append(agent)
-        self._send(number, agent, job)
-
-    def _send(self, number: int, agent: str | None, content: Any) -> None:
+        worker = self._all[number]
+        worker.waiting[agent] = whose or str(agent)
         try:
-            send(self._all[number].connection, agent, content)
+            send(worker.connection, agent, job)
         except OSError as error:
             raise self._death(number) from error
+        except BaseException:
+            self._lose(number)
+            raise
 
-    def post(self, number: int, agent: str, job: Any) -> None:
-        """
-        As ``send``, with the next ``flush``: each message wakes a process, which costs as much as a small job.
-
-        :param number: of the worker
-        :param agent: whose job it is; it has no other one at the time
-        :param job: to do, small and without tensors
-        """
-        self._all[number].posted[agent] = job
-
-    def flush(self) -> None:
-        """
-        Send what was posted.
-
-        :raises RuntimeError: if a worker is dead
-        """
-        for number, worker in enumerate(self._all):
-            if worker.posted:
-                worker.waiting.extend(worker.posted)
-                jobs = dict(worker.posted)
-                worker.posted.clear()
-                self._send(number, None, jobs)
-
-    def receive(self, number: int, agent: str) -> Any:
+    def receive(self, number: int, agent: str | None) -> Any:
         """
         :param number: of the worker
-        :param agent: whose job it was given
+        :param agent: whose job it was given, as for ``send``
         :return: the result
         :raises RuntimeError: if the worker died over it
         """
@@ -105,14 +82,23 @@ class Workers:
         while agent not in worker.arrived:
             try:
                 worker.inbox.wait()
+            except EOFError as error:
+                raise self._death(number) from error
+            try:
                 whose, result = receive(worker.connection)
             except (EOFError, OSError) as error:
                 raise self._death(number) from error
-            results = result if whose is None else {whose: result}
-            for name in results:
-                worker.waiting.remove(name)
-            worker.arrived.update(results)
+            except BaseException:
+                self._lose(number)
+                raise
+            worker.waiting.pop(whose, None)
+            worker.arrived[whose] = result
         return worker.arrived.pop(agent)
+
+    def _lose(self, number: int) -> None:
+        """A message is cut off, by Ctrl-C for instance: nobody can tell where the next one begins."""
+        self._all[number].connection.close()
+        self._all[number].process.terminate()
 
     def _death(self, number: int) -> RuntimeError:
         worker = self._all[number]
@@ -120,9 +106,10 @@ class Workers:
         worker.process.join(1.0)
         return RuntimeError(
             f"Worker process {number} (exit code {worker.process.exitcode}) died while it was busy with"
-            f" {', '.join(worker.waiting)}; see its own error above, if it could write one. The next learn() starts new ones;"
-            " with jobs=1 there are none. A script that uses them needs the line 'if __name__ == \"__main__\":' before what it"
-            " does."
+            f" {', '.join(worker.waiting.values())}; see its own error above, if it could write one. Models that learned in it"
+            " are what they were before this learn(), or when they were last saved or evaluated. The next learn() starts new"
+            " workers; with jobs=1 there are none. A script that uses them needs the line 'if __name__ == \"__main__\":' before"
+            " what it does."
         )
 
     def end(self) -> None:

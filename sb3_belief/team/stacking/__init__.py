@@ -1,5 +1,5 @@
 """Policies with equal networks act together: one pass for all, their weights stacked into one tensor for each layer."""
 
-from sb3_belief.team.stacking.passes import Part, Together, make
+from sb3_belief.team.stacking.acting import ActsTogether, acting_together
 
-__all__ = ["Part", "Together", "make"]
+__all__ = ["ActsTogether", "acting_together"]

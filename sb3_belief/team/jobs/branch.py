@@ -1,0 +1,181 @@
+"""In a worker process: models that learn there, from when they arrive until they are sent back."""
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+
+from sb3_belief.team.acting import Actor
+from sb3_belief.team.jobs.arrived import Before, Recorder, captured, failure_of, rebuild
+from sb3_belief.team.jobs.branch_hub import BranchHub
+from sb3_belief.team.jobs.messages import Message, dumps, loads
+from sb3_belief.team.members import Member
+from sb3_belief.team.stacking import acting_together
+from sb3_belief.team.streams import RandomStream, StreamSwitch
+
+
+class Arriving(NamedTuple):
+    """
+    An agent that is to learn in another process.
+
+    :param model: as ``pack`` made it
+    :param wrappers: class and state of those around its environment, the outermost first
+    :param stream: what it draws from
+    """
+
+    model: Message
+    wrappers: list[tuple[type[VecEnvWrapper], dict[str, Any]]]
+    stream: RandomStream
+
+
+class Order(NamedTuple):
+    """
+    :param method: of ``BranchHub``, or one of ``Branch``
+    :param args: of the method
+    :param is_answered: whether it has an answer; otherwise another order follows, which has
+    """
+
+    method: str
+    args: tuple[Any, ...] = ()
+    is_answered: bool = True
+
+
+# Of a wrapper, what belongs to where it is
+_OF_ITS_PLACE = ("venv", "class_attributes")
+
+
+def wrappers_of(env: VecEnv) -> Iterator[VecEnvWrapper]:
+    """
+    :param env: of a model
+    :return: what is around the agent's own environment, the outermost first
+    """
+    while isinstance(env, VecEnvWrapper):
+        yield env
+        env = env.venv
+
+
+def state_of(wrapper: VecEnvWrapper) -> dict[str, Any]:
+    """
+    :param wrapper: around an agent's environment
+    :return: all of it but what it wraps
+    """
+    return {name: value for name, value in vars(wrapper).items() if name not in _OF_ITS_PLACE}
+
+
+class Branch:
+    """One part of a team after another learns here, each from ``open`` to ``close``."""
+
+    def __init__(self) -> None:
+        self._found = _nothing()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._stack = ExitStack()
+        self._hub: BranchHub | None = None
+        self._models: dict[str, BaseAlgorithm] = {}
+        self._streams: dict[str, RandomStream] = {}
+        self._recorders: dict[str, Recorder] = {}
+        self._before: dict[str, Before] = {}
+        # Of whom it is not known yet that they can be sent back after an update
+        self._unchecked: set[str] = set()
+
+    def do(self, order: Order | Message) -> Message | None:
+        """
+        :param order: from the main process
+        :return: the answer, if there is to be one: with what was raised, but else as always, if the order has failed
+        """
+        is_answered = True
+        with captured(self._found):
+            try:
+                method, args, is_answered = loads(order) if isinstance(order, Message) else order
+                own: dict[str, Callable[..., None]] = {
+                    "open": self.open,
+                    "end_rollouts": self.end_rollouts,
+                    "look": self.look,
+                    "close": self.close,
+                }
+                if method in own:
+                    own[method](*args)
+                elif self._found["error"] is None:
+                    getattr(self._hub, method)(*args)
+            except BaseException as error:
+                self._found.update(failure_of(error))
+        if not is_answered:
+            return None
+        if self._hub is not None:
+            self._found["states"], self._found["actions"] = self._hub.take_moves()
+        self._found["log"] = {agent: recorder.take() for agent, recorder in self._recorders.items()}
+        found, self._found = self._found, _nothing()
+        if self._hub is None:
+            self._clear()
+        try:
+            return dumps(found, {})
+        except Exception as error:
+            return dumps({**_nothing(), **failure_of(error)}, {})
+
+    def open(self, arriving: dict[str, Arriving], learn: Callable[..., None], hub_kwargs: dict[str, Any]) -> None:
+        """
+        :param arriving: the agents
+        :param learn: runs ``learn()`` of a model with a callback
+        :param hub_kwargs: of ``BranchHub``
+        """
+        idle = RandomStream(0)
+        streams = self._stack.enter_context(StreamSwitch(idle))
+        hub = BranchHub(streams=streams, idle=idle, **hub_kwargs)
+        members: dict[str, Member] = {}
+        for agent, (job, wrappers, stream) in arriving.items():
+            recorder = self._recorders[agent] = Recorder()
+            model = self._models[agent] = rebuild(job, recorder)
+            env: VecEnv = hub.agent_envs[agent]
+            for wrapper_class, state in reversed(wrappers):
+                wrapper = wrapper_class.__new__(wrapper_class)
+                vars(wrapper).update(state, venv=env, class_attributes=dict(inspect.getmembers(wrapper_class)))
+                env = wrapper
+            model.env, model._vec_normalize_env = env, unwrap_vec_normalize(env)
+            self._before[agent], self._streams[agent] = Before(model), stream
+            members[agent] = Member(partial(learn, model), Actor(model, model._vec_normalize_env).go_on, stream)
+        self._unchecked = set(members)
+        self._stack.enter_context(acting_together(hub, self._models))  # type: ignore[arg-type]
+        self._hub = hub
+        hub.start(members)
+
+    def end_rollouts(self) -> None:
+        """Those who have ended a rollout are updated."""
+        assert self._hub is not None
+        for agent in self._unchecked.intersection(self._hub.end_rollouts()):
+            # Rather now than when there is much to lose
+            self._before[agent].check()
+            self._unchecked.remove(agent)
+
+    def look(self) -> None:
+        """Say how the models are."""
+        self._found["changes"] = self._changes(with_buffers=False)
+
+    def close(self) -> None:
+        """End what is under way, and say how the models are."""
+        try:
+            if self._hub is not None:
+                self._hub.stop()
+                self._found["changes"] = self._changes(with_buffers=True)
+        finally:
+            self._stack.close()
+            self._hub = None
+
+    def _changes(self, with_buffers: bool) -> dict[str, Any]:
+        return {
+            agent: {
+                "model": before.changes(),
+                "wrappers": [state_of(wrapper) for wrapper in wrappers_of(self._models[agent].env)],  # type: ignore[arg-type]
+                "stream": self._streams[agent],
+                "buffer": before.buffer() if with_buffers else None,
+            }
+            for agent, before in self._before.items()
+        }
+
+
+def _nothing() -> dict[str, Any]:
+    return {"output": "", "warnings": [], "error": None, "states": {}, "actions": {}, "log": {}, "changes": {}}

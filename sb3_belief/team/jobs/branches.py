@@ -1,0 +1,218 @@
+"""
+Agents whose whole ``learn()`` runs in a worker process, as the main process sees them.
+
+A rollout is SB3's own work for each agent: its policy, its buffer, its bookkeeping. All of that is shared out only if the
+agents' loops are. So their models move to a worker when a team begins to learn; all that goes to and fro then is what the
+agents are given of each joint step, and what they do. They come back when the team has learned, or when somebody looks at
+them, which is asked of the callbacks before (see ``leaves_models_alone``).
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+
+from sb3_belief.team.jobs.branch import Arriving, Order, state_of, wrappers_of
+from sb3_belief.team.jobs.messages import dumps, loads
+from sb3_belief.team.jobs.updating import modules_of, pack, raise_failure, show, tell, write_buffer, write_changes
+from sb3_belief.team.jobs.workers import Workers
+from sb3_belief.team.streams import RandomStream
+from sb3_belief.team.vec_env import TeamObs
+from sb3_belief.team.views import AgentPart
+
+if TYPE_CHECKING:
+    from sb3_belief.team.lockstep import Lockstep
+
+# Their callbacks take a model as something that predicts and can be saved
+_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+
+
+def leaves_models_alone(callback: BaseCallback | None) -> bool:
+    """
+    :param callback: of a team
+    :return: whether it looks at the team's models through the team's own methods only, and changes nothing in them: those of
+        SB3 and sb3-contrib, and what they call
+    """
+    if callback is None:
+        return True
+    if isinstance(callback, ConvertCallback):
+        return callback.callback is None
+    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
+        return False
+    called = [
+        *getattr(callback, "callbacks", []),
+        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
+    ]
+    return all(leaves_models_alone(each) for each in called)
+
+
+def can_learn_elsewhere(model: BaseAlgorithm, hub: "Lockstep", agent: str) -> bool:
+    """
+    :param model: of an agent
+    :param hub: in which it learns
+    :param agent: its name
+    :return: whether its methods are those of its class, nobody has hooked into its networks, and its environment is the one
+        that the team has given it
+    """
+    for owner in (model, model.policy):
+        if any(inspect.isroutine(getattr(type(owner), name, None)) for name in vars(owner)):
+            return False
+    if any(vars(module)[hooks] for _, module in modules_of(model) for hooks in _HOOKS):
+        return False
+    env = model.env
+    for wrapper in wrappers_of(env):  # type: ignore[arg-type]
+        env = wrapper.venv
+    return env is hub.agent_envs[agent]
+
+
+class RemoteBranch:
+    """
+    A branch that learns in a worker (see ``lockstep.Branch``).
+
+    :param hub: in which the rest learns
+    :param workers: the processes
+    :param number: of the worker
+    :param models: of the agents, kept as they were before, until they are looked at
+    :param streams: what they draw from
+    :param learn: runs ``learn()`` of a model with a callback
+    """
+
+    def __init__(
+        self,
+        hub: "Lockstep",
+        workers: Workers,
+        number: int,
+        models: Mapping[str, BaseAlgorithm],
+        streams: Mapping[str, RandomStream],
+        learn: Callable[..., None],
+    ):
+        self.agents = list(models)
+        self._hub, self._workers, self._number = hub, workers, number
+        self._models, self._streams, self._learn = dict(models), streams, learn
+        self._vote = True
+        self._is_open, self._is_busy, self._has_moved = False, False, False
+        self._answer: dict[str, Any] | None = None
+
+    def _send(self, method: str, *args: Any, is_answered: bool = True) -> None:
+        self._workers.send(self._number, None, Order(method, args, is_answered), ", ".join(self.agents))
+        self._is_busy = is_answered
+
+    def _receive(self) -> dict[str, Any]:
+        """The answer to the last order, with what was raised in it."""
+        answer = loads(self._workers.receive(self._number, None))
+        self._is_busy = False
+        show(answer)
+        for agent, log in answer["log"].items():
+            tell(self._models[agent], log)
+        return answer
+
+    # For the hub
+
+    def start(self, first: TeamObs, masks: TeamObs | None, vote: bool) -> None:
+        hub, self._vote = self._hub, vote
+        hub_kwargs = {
+            "first": first,
+            "masks": self._of_these(masks),
+            "vote": vote,
+            "num_envs": hub.num_envs,
+            "observation_spaces": {agent: hub.observation_spaces[agent] for agent in self.agents},
+            "action_spaces": hub.action_spaces,
+            "scripted_action_spaces": hub.scripted_action_spaces,
+            "render_mode": hub.render_mode,
+        }
+        arriving = {agent: self._arriving(agent) for agent in self.agents}
+        self._is_open = self._has_moved = True
+        order = dumps(Order("open", (arriving, self._learn, hub_kwargs)), {})
+        self._workers.send(self._number, None, order, ", ".join(self.agents))
+        self._is_busy = True
+
+    def _arriving(self, agent: str) -> Arriving:
+        model = self._models[agent]
+        wrappers = [(type(wrapper), state_of(wrapper)) for wrapper in wrappers_of(model.env)]  # type: ignore[arg-type]
+        return Arriving(pack_of(agent, model), wrappers, self._streams[agent])
+
+    def step(self, parts: dict[str, AgentPart], masks: TeamObs | None) -> None:
+        theirs = {agent: (parts[agent], parts[agent].obs.strides) for agent in self.agents}
+        self._send("step", theirs, self._of_these(masks), is_answered=not self._vote)
+        self._has_moved = True
+
+    def go_on(self, go_on: bool) -> None:
+        self._send("go_on", go_on)
+        self._has_moved = True
+
+    def end_rollouts(self) -> None:
+        self._send("end_rollouts")
+        self._has_moved = True
+
+    def act(self, agents: Sequence[str]) -> None:
+        self._send("act", agents)
+        self._has_moved = True
+
+    def result(self) -> tuple[dict[str, str], TeamObs]:
+        self._wait()
+        answer, self._answer = self._answer, None
+        if answer is None:
+            return {}, {}
+        raise_failure(answer)
+        return answer["states"], answer["actions"]
+
+    def _wait(self) -> None:
+        """Keep what has come of the last order, if nobody has asked for it yet."""
+        if self._is_busy:
+            self._answer = self._receive()
+
+    def _of_these(self, masks: TeamObs | None) -> TeamObs | None:
+        return None if masks is None else {agent: masks[agent] for agent in self.agents if agent in masks}
+
+    # For the team
+
+    def look(self) -> None:
+        """
+        Make the models here what they are there.
+
+        :raises BaseException: if that cannot be
+        """
+        if self._is_open and self._has_moved:
+            self._wait()
+            self._bring("look")
+            self._has_moved = False
+
+    def close(self) -> None:
+        """
+        The same, and nothing is under way there any more.
+
+        :raises BaseException: if that cannot be
+        """
+        if self._is_open:
+            self._is_open = False
+            self._wait()
+            self._bring("close")
+
+    def _bring(self, method: str) -> None:
+        self._send(method)
+        answer = self._receive()
+        for agent, changes in answer["changes"].items():
+            model = self._models[agent]
+            write_changes(model, changes["model"])
+            for wrapper, state in zip(wrappers_of(model.env), changes["wrappers"], strict=True):  # type: ignore[arg-type]
+                vars(wrapper).update(state)
+            self._streams[agent].become(changes["stream"])
+            if changes["buffer"] is not None:
+                write_buffer(model, changes["buffer"])
+        raise_failure(answer)
+
+
+def pack_of(agent: str, model: BaseAlgorithm) -> Any:
+    """
+    :param agent: whose model it is
+    :param model: the model
+    :return: the same as a message
+    :raises ValueError: if it cannot be one
+    """
+    try:
+        return pack(model)
+    except ValueError as error:
+        raise ValueError(f"Agent {agent!r} cannot be updated in another process. {error}") from error
