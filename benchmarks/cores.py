@@ -21,6 +21,8 @@ from sb3_belief import Team
 from sb3_belief.team.lockstep import Lockstep
 
 _KEY, _CONTROL = "two_cores_vs_one", "two_processes_vs_one"
+# In each learn(), since with several jobs models travel at its beginning and its end
+_ROLLOUTS = 3
 
 
 def largest_difference(a: Team, b: Team) -> float:
@@ -40,7 +42,7 @@ class _PhasesLoop(TeamLoop):
     """Also notes how many seconds on the wall each of its rollouts and each update of all agents took."""
 
     def __init__(self, team: Team) -> None:
-        super().__init__(team)
+        super().__init__(team, _ROLLOUTS)
         self.rollouts: list[float] = []
         self.updates: list[float] = []
 
@@ -62,7 +64,7 @@ class _PhasesLoop(TeamLoop):
 
 def _learner(quick: bool) -> TeamLoop:
     th.set_num_threads(1)
-    return TeamLoop(junction_team("belief_ppo", quick))
+    return TeamLoop(junction_team("belief_ppo", quick), _ROLLOUTS)
 
 
 def run(report: Report) -> None:

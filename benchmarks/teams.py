@@ -79,13 +79,14 @@ class TeamLoop:
     Rollouts of a team and the updates after them.
 
     :param team: what learns
+    :param rollouts: how many of them in each call
     """
 
-    def __init__(self, team: Team) -> None:
+    def __init__(self, team: Team, rollouts: int = 1) -> None:
         self.team = team
-        # One rollout: what SB3 collects before each update
+        # What SB3 collects before each update
         models = team.agents.values()
-        self._total = max(model.n_steps * model.n_envs for model in models)  # type: ignore[attr-defined]
+        self._total = rollouts * max(model.n_steps * model.n_envs for model in models)  # type: ignore[attr-defined]
 
     def __call__(self) -> int:
         """

@@ -58,11 +58,12 @@ class Team:
     :param log_dir: folder of CSV logs: ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None: none
     :param tensorboard_log: folder of TensorBoard logs: ``Team_<k>`` and ``Team_<k>/agents/<agent>``; None: none
     :param device: of all models
-    :param jobs: how many processes share the agents whose algorithms are on-policy (PPO, A2C, ...), this one among them: each
-        updates its agents and, after their first update, chooses their actions (not with callbacks, gSDE or networks of one's
-        own); with any number the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can
-        be imported (``if __name__ == "__main__":``); with ``torch.set_num_threads(1)`` each takes one core. ``train()`` of
-        an algorithm of one's own may read and change all of its model but the environment
+    :param jobs: how many processes share the agents whose algorithms are on-policy (PPO, A2C, ...), this one among them. Each
+        agent learns in one of them, or is only updated there if it has a callback of its own, if the team has one that is not
+        SB3's or sb3-contrib's, or if methods of its model were replaced: then somebody looks at it meanwhile. With any number
+        the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can be imported
+        (``if __name__ == "__main__":``); with ``torch.set_num_threads(1)`` each takes one core. An algorithm of one's own may
+        read and change all of its model; what else it leaves in memory stays in its process
     :param agent_kwargs: {agent: {argument: value}} for single agents, overriding ``kwargs``
     :param kwargs: further arguments of the algorithm class for all agents
     :raises TypeError: if ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
@@ -131,8 +132,8 @@ class Team:
     @property
     def agents(self) -> dict[str, BaseAlgorithm]:
         """
-        :return: {agent: its model}. While the team learns with several ``jobs``, models are up to date when they are asked for
-            here, not for who has kept them
+        :return: {agent: its model}. While the team learns with several ``jobs``, models that learn in other processes are up to
+            date when they are asked for here, not for who has kept them
         """
         self._jobs.look()
         return self._roster.models

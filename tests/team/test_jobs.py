@@ -1,4 +1,4 @@
-"""Agents that are updated, and act, in several processes learn, draw and log the same as in one, bit for bit."""
+"""Agents that learn, or are updated, in several processes learn, draw and log the same as in one, bit for bit."""
 
 import gc
 import json
@@ -7,7 +7,6 @@ import os
 import pickle
 import signal
 import warnings
-from collections import Counter
 from copy import deepcopy
 from typing import Any
 
@@ -21,9 +20,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.team.jobs.workers import Workers
-from sb3_belief.team.lockstep import Lockstep
-from sb3_belief.team.members import ACTS_HERE
 from sb3_belief.zoo.cli import train_main
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import ToyEnv
@@ -76,6 +72,16 @@ def flat(value):
     return repr(value)
 
 
+def rollout_of(model):
+    attributes = vars(model.rollout_buffer) if hasattr(model, "rollout_buffer") else {}
+    return {name: value for name, value in attributes.items() if isinstance(value, (np.ndarray, int))}
+
+
+def statistics_of(team, agent):
+    found = team._roster.statistics.get(agent)
+    return None if found is None else [found.obs_rms.mean, found.obs_rms.var, found.ret_rms.var, found.returns]
+
+
 def everything(team, callbacks):
     obs = team.get_env().reset()
     kept: dict[str, Any] = {"prediction": team.predict(obs, deterministic=True)[0]}
@@ -90,6 +96,11 @@ def everything(team, callbacks):
             "stream": (stream._torch, stream._numpy.state),
             "logged": logged,
             "counts": (model._n_updates, model.num_timesteps, model._current_progress_remaining),
+            "where it is": (model._last_obs, model._last_episode_starts),
+            "episodes": [(episode["r"], episode["l"]) for episode in model.ep_info_buffer],
+            # An update in a worker uses the rollout up there
+            "rollout": None if agent in callbacks else rollout_of(model),
+            "statistics": statistics_of(team, agent),
             "callback": callbacks[agent].seen if agent in callbacks else None,
             "names": sorted(vars(model)),
         }
@@ -135,8 +146,10 @@ CASES: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
+@pytest.mark.parametrize("watched", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_the_same_is_learned(case):
+def test_the_same_is_learned(case, watched):
+    """Agents with callbacks are updated elsewhere, those without learn there."""
     algo, kwargs = CASES[case]
     # Two rollouts and a half: the second learn() goes on where it may
     n = 2 * 5 * kwargs.get("n_steps", 16) // 2
@@ -144,28 +157,12 @@ def test_the_same_is_learned(case):
     for jobs in (1, 3 if case == "ppo" else 2):
         team = toy_team(algo, jobs, **kwargs)
         # The agents of the first worker and of this process
-        callbacks = {agent: Draws() for agent in team.possible_agents[:2]}
+        callbacks = {agent: Draws() for agent in team.possible_agents[:2]} if watched else {}
         team.learn(n, agent_callbacks=callbacks, log_interval=2)
         team.learn(n, agent_callbacks=callbacks, reset_num_timesteps=False)
         results.append(everything(team, callbacks))
     for key, one in results[0].items():
         assert one == results[1][key], key
-
-
-@pytest.fixture
-def passes(monkeypatch):
-    """
-    :return: {agent: how many of its policy's passes were sent to a worker}
-    """
-    counts: Counter[str] = Counter()
-    post = Workers.post
-
-    def count(self, number, agent, job):
-        counts[agent] += 1
-        post(self, number, agent, job)
-
-    monkeypatch.setattr(Workers, "post", count)
-    return counts
 
 
 class Pushes(ToyEnv):
@@ -186,91 +183,6 @@ class OwnNetwork(FlattenExtractor):
     def forward(self, observations):
         self.passes += 1
         return super().forward(observations) * (1 + self.passes % 3)
-
-
-class Disturbs(BaseCallback):
-    """A team's callback that changes an agent within rollouts."""
-
-    model: Any
-
-    def _on_step(self):
-        with th.no_grad():
-            if self.n_calls % 7 == 0:
-                # Written to, and replaced
-                next(self.model.agents["agent_0"].policy.parameters()).mul_(1.01)
-                policy = self.model.agents["agent_0"].policy.action_net
-                policy.bias = th.nn.Parameter(policy.bias + 0.1)
-        return True
-
-
-# Of 5 rollouts of 8 steps, in two learn(): how many of the first agent's passes a worker makes, none of the first rollout
-ACTING: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
-    "elsewhere": ({}, {}, 32),
-    "with masks": ({"algo": MaskablePPO, "env_id": EASY}, {}, 32),
-    "with a belief": ({"algo": BeliefPPO, "policy": "BeliefPolicy", "env_id": EASY, "history_length": 30}, {}, 32),
-    "without callbacks only": ({}, {"agent_0": Draws}, 0),
-    "noise of a rollout": ({"policy_kwargs": {"log_std_init": -1.0}, "use_sde": True, "env_id": Pushes}, {}, 0),
-    "own networks": ({"policy_kwargs": {"features_extractor_class": OwnNetwork}}, {}, 0),
-    "recurrent": ({"algo": RecurrentPPO, "policy": "MlpLstmPolicy"}, {}, 0),
-    # Each rollout goes on elsewhere until a weight is changed
-    "disturbed": ({}, {"team": Disturbs}, 6 + 5 + 7 + 6),
-}
-
-
-@pytest.mark.parametrize("case", ACTING)
-def test_who_acts_elsewhere(case, passes):
-    team_kwargs, callbacks, expected = ACTING[case]
-    results = []
-    for jobs in (1, 2):
-        passes.clear()
-        team = toy_team(**{"algo": PPO, "jobs": jobs, "n_steps": 8, "batch_size": 8, "n_epochs": 1, **team_kwargs})
-        for n_rollouts in (3, 2):
-            own = {agent: callback() for agent, callback in callbacks.items()}
-            team_callback = own.pop("team", None)
-            team.learn(16 * n_rollouts, team_callback, agent_callbacks=own, reset_num_timesteps=False)
-        results.append(everything(team, {}))
-        in_worker, here = team.possible_agents[:2]
-        assert (passes[in_worker], passes[here]) == (expected if jobs == 2 else 0, 0)
-        assert all("forward" not in vars(model.policy) for model in team.agents.values())
-    assert results[0] == results[1]
-
-
-def test_workers_are_asked_before_others_prepare_to_act(monkeypatch):
-    # Of each joint step: who asked for a pass elsewhere, what was sent, who is ready to act here
-    steps: list[list[Any]] = [[]]
-    joint_step, send, post, wait = Lockstep._step, Workers._send, Workers.post, Lockstep.wait
-
-    def new_step(self, actions):
-        steps.append([])
-        return joint_step(self, actions)
-
-    def note_send(self, number, agent, content):
-        if agent is None:
-            steps[-1].append(("sent", *content))
-        send(self, number, agent, content)
-
-    def note_post(self, number, agent, job):
-        steps[-1].append(("asks", agent))
-        post(self, number, agent, job)
-
-    def note_wait(self, agent, state):
-        if state == ACTS_HERE:
-            steps[-1].append(("ready", agent))
-        wait(self, agent, state)
-
-    monkeypatch.setattr(Lockstep, "_step", new_step)
-    monkeypatch.setattr(Lockstep, "wait", note_wait)
-    monkeypatch.setattr(Workers, "_send", note_send)
-    monkeypatch.setattr(Workers, "post", note_post)
-    team = toy_team(PPO, 2, EASY, n_steps=8, batch_size=8, n_epochs=1)
-    team.learn(16 * 3)
-    first, second, third, fourth, fifth = team.possible_agents
-    asks = [("asks", agent) for agent in (first, third, fifth)]
-    ready = [("ready", agent) for agent in (second, fourth)]
-    # From the second step after the first update on, and without those that follow an update or end the learning
-    within = [step for i, step in enumerate(steps) if i > 8 and i % 8]
-    assert len(within) == 14
-    assert all(step == [*asks, ("sent", first, third, fifth), *ready] for step in within)
 
 
 def test_a_copy_of_a_policy_acts_by_itself():
@@ -294,25 +206,6 @@ def test_a_copy_of_a_policy_acts_by_itself():
         after = [copy(obs, deterministic=True)[1] for copy in copies]
     assert th.equal(before[0], before[1]) and th.equal(before[0], after[0]) and th.equal(before[1], after[1])
     assert float(before[0].abs().max()) > 0
-
-
-class FailsLater(PPO):
-    """Its policy cannot act any more after the first update."""
-
-    policy: Any
-
-    def train(self):
-        super().train()
-        self.policy.action_dist = None
-
-
-def test_an_error_of_a_policy_in_a_worker_is_seen(passes):
-    for jobs in (1, 2):
-        team = toy_team({"agent_0": FailsLater, "agent_1": PPO}, jobs, **PPO_SMALL)
-        with pytest.raises(ValueError, match="Invalid action distribution") as caught:
-            team.learn(64)
-        assert "agent 'agent_0'" in notes(caught.value) and "joint step 8" in notes(caught.value)
-    assert passes["agent_0"] == 1
 
 
 class Odd(PPO):
@@ -349,12 +242,13 @@ class Odd(PPO):
 
 
 @pytest.mark.filterwarnings("ignore:odd")
-def test_an_algorithm_of_ones_own_may_change_anything_of_its_model():
+@pytest.mark.parametrize("watched", [False, True])
+def test_an_algorithm_of_ones_own_may_change_anything_of_its_model(watched):
     results = []
     for jobs in (1, 2):
         team = toy_team(Odd, jobs, **PPO_SMALL)
         before = {agent: [model.policy, *model.policy.parameters()] for agent, model in team.agents.items()}
-        callbacks = {agent: Draws() for agent in team.possible_agents}
+        callbacks = {agent: Draws() for agent in team.possible_agents} if watched else {}
         with pytest.warns(UserWarning, match="odd 3"):
             team.learn(3 * 16, agent_callbacks=callbacks)
         for agent, model in team.agents.items():
@@ -393,13 +287,14 @@ def notes(error):
 
 
 @pytest.mark.filterwarnings("ignore:odd", "ignore::RuntimeWarning")
-def test_an_error_in_a_worker(tmp_path):
+@pytest.mark.parametrize("watched", [False, True])
+def test_an_error_in_a_worker(tmp_path, watched):
     states = []
     for jobs in (1, 2):
         own = {"agent_0": {"at": 2, "error": ZeroDivisionError("by hand")}}
         team = toy_team(Odd, jobs, **PPO_SMALL, agent_kwargs=own)
         with pytest.raises(ZeroDivisionError, match="by hand") as caught:
-            team.learn(64)
+            team.learn(64, Draws() if watched else None)
         assert "agent 'agent_0'" in notes(caught.value) and "joint step 16" in notes(caught.value)
         states.append(parameters(team.agents["agent_0"]))
         if jobs == 2:

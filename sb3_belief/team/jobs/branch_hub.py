@@ -1,12 +1,11 @@
 """The hub of agents that learn in a worker process, in lockstep with the rest of their team."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from sb3_belief.team.hub import Hub
-from sb3_belief.team.jobs.messages import own_array
 from sb3_belief.team.members import FINISHED, ROLLOUT_ENDED, Member
 from sb3_belief.team.streams import RandomStream, StreamSwitch
 from sb3_belief.team.vec_env import TeamObs
@@ -47,14 +46,14 @@ class BranchHub(Hub):
         self._start(members, self._streams)
         self._end_turns(members)
 
-    def step(self, parts: Mapping[str, tuple[AgentPart, tuple[int, ...]]], masks: TeamObs | None) -> None:
+    def step(self, parts: dict[str, AgentPart], masks: TeamObs | None) -> None:
         """
-        :param parts: of the agents, each with the strides of its observations
+        :param parts: of the agents
         :param masks: of the agents, if there are any
         """
-        self._parts = {agent: part._replace(obs=own_array(part.obs, strides)) for agent, (part, strides) in parts.items()}
-        self._obs = {agent: part.obs for agent, part in self._parts.items()}
-        self._starts = {agent: part.dones for agent, part in self._parts.items()}
+        self._parts = parts
+        self._obs = {agent: part.obs for agent, part in parts.items()}
+        self._starts = {agent: part.dones for agent, part in parts.items()}
         self._given_masks, self._go_on = masks, True
         if self._vote:
             for agent in self._learning():

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
@@ -97,8 +98,10 @@ class RemoteBranch:
         self._answer: dict[str, Any] | None = None
 
     def _send(self, method: str, *args: Any, is_answered: bool = True) -> None:
-        self._workers.send(self._number, None, Order(method, args, is_answered), ", ".join(self.agents))
-        self._is_busy = is_answered
+        order = Order(method, args, is_answered)
+        # The models are more than a simple message
+        self._workers.send(self._number, None, dumps(order, {}) if method == "open" else order, ", ".join(self.agents))
+        self._is_busy, self._has_moved = is_answered, True
 
     def _receive(self) -> dict[str, Any]:
         """The answer to the last order, with what was raised in it."""
@@ -124,10 +127,8 @@ class RemoteBranch:
             "render_mode": hub.render_mode,
         }
         arriving = {agent: self._arriving(agent) for agent in self.agents}
-        self._is_open = self._has_moved = True
-        order = dumps(Order("open", (arriving, self._learn, hub_kwargs)), {})
-        self._workers.send(self._number, None, order, ", ".join(self.agents))
-        self._is_busy = True
+        self._is_open = True
+        self._send("open", arriving, self._learn, hub_kwargs)
 
     def _arriving(self, agent: str) -> Arriving:
         model = self._models[agent]
@@ -135,21 +136,16 @@ class RemoteBranch:
         return Arriving(pack_of(agent, model), wrappers, self._streams[agent])
 
     def step(self, parts: dict[str, AgentPart], masks: TeamObs | None) -> None:
-        theirs = {agent: (parts[agent], parts[agent].obs.strides) for agent in self.agents}
-        self._send("step", theirs, self._of_these(masks), is_answered=not self._vote)
-        self._has_moved = True
+        self._send("step", {agent: parts[agent] for agent in self.agents}, self._of_these(masks), is_answered=not self._vote)
 
     def go_on(self, go_on: bool) -> None:
         self._send("go_on", go_on)
-        self._has_moved = True
 
     def end_rollouts(self) -> None:
         self._send("end_rollouts")
-        self._has_moved = True
 
     def act(self, agents: Sequence[str]) -> None:
         self._send("act", agents)
-        self._has_moved = True
 
     def result(self) -> tuple[dict[str, str], TeamObs]:
         self._wait()
@@ -198,7 +194,7 @@ class RemoteBranch:
             model = self._models[agent]
             write_changes(model, changes["model"])
             for wrapper, state in zip(wrappers_of(model.env), changes["wrappers"], strict=True):  # type: ignore[arg-type]
-                vars(wrapper).update(state)
+                vars(wrapper).update({key: value for key, value in state.items() if not isinstance(value, spaces.Space)})
             self._streams[agent].become(changes["stream"])
             if changes["buffer"] is not None:
                 write_buffer(model, changes["buffer"])

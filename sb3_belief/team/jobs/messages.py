@@ -120,20 +120,6 @@ def receive(connection: Connection) -> tuple[str | None, Any]:
     return agent, Message(content, buffers)
 
 
-def own_array(array: np.ndarray, strides: tuple[int, ...]) -> np.ndarray:
-    """
-    :param array: the values
-    :param strides: of the array that they were
-    :return: the same in memory and order of numpy's own, see ``own_tensor``
-    """
-    if array.strides == strides or array.size == 0 or min(strides) < 0:
-        return array.copy()
-    extent = sum((n - 1) * stride for n, stride in zip(array.shape, strides, strict=True)) + array.itemsize
-    result: np.ndarray = np.ndarray(array.shape, array.dtype, np.empty(extent, np.uint8), strides=strides)
-    result[...] = array
-    return result
-
-
 def own_tensor(array: np.ndarray, stride: tuple[int, ...]) -> th.Tensor:
     """
     :param array: the values

@@ -108,8 +108,8 @@ class Workers:
             f"Worker process {number} (exit code {worker.process.exitcode}) died while it was busy with"
             f" {', '.join(worker.waiting.values())}; see its own error above, if it could write one. Models that learned in it"
             " are what they were before this learn(), or when they were last saved or evaluated. The next learn() starts new"
-            " workers; with jobs=1 there are none. A script that uses them needs the line 'if __name__ == \"__main__\":' before"
-            " what it does."
+            " workers; with jobs=1 there are none. A script that uses them needs the line"
+            " 'if __name__ == \"__main__\":' before what it does."
         )
 
     def end(self) -> None:
