@@ -132,8 +132,8 @@ class Team:
     @property
     def agents(self) -> dict[str, BaseAlgorithm]:
         """
-        :return: {agent: its model}. While the team learns with several ``jobs``, models that learn in other processes are up to
-            date when they are asked for here, not for who has kept them
+        :return: {agent: its model}. While the team learns with several ``jobs``, models in other processes are up to date for
+            who asks here, not for who has kept them
         """
         self._jobs.look()
         return self._roster.models

@@ -79,7 +79,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         "--jobs",
         type=_positive,
         default=1,
-        help="processes that share the agents' updates and actions; the same is learned with any number",
+        help="processes in which the agents learn; the same is learned with any number",
     )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
     parser.add_argument("-i", "--trained-agent", help="a run's folder or a team's zip to go on from")

@@ -295,3 +295,30 @@ def test_a_model_that_could_not_come_back_is_found_out_at_its_first_update():
     with pytest.raises(RuntimeError, match=r"adds or removes parameters.* use jobs=1") as caught:
         team.learn(640)
     assert "joint step 8 " in notes(caught.value)
+
+
+class Opens(PPO):
+    """It gets what cannot be sent, but not at its first update."""
+
+    n_trained = 0
+
+    def train(self):
+        super().train()
+        self.n_trained += 1
+        if self.n_trained == 2:
+            self.file = open(os.devnull, "w")
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::RuntimeWarning")
+def test_a_model_that_cannot_come_back_does_not_keep_others():
+    learned = []
+    for jobs in (1, 2):
+        classes = {"agent_0": Opens, "agent_1": PPO, "agent_2": PPO}
+        team = toy_team(classes, jobs, lambda: ToyEnv(3), **PPO_SMALL)
+        if jobs == 1:
+            team.learn(48)
+        else:
+            with pytest.raises(Exception, match="(?i)pickle"):
+                team.learn(48)
+        learned.append([parameters(team.agents[agent]) for agent in ("agent_1", "agent_2")])
+    assert all(th.equal(one, two) for one, two in zip(*learned, strict=True))

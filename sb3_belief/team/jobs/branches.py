@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
-from sb3_belief.team.jobs.branch import Arriving, Order, state_of, wrappers_of
+from sb3_belief.team.jobs.host import Arriving, Order, state_of, wrappers_of
 from sb3_belief.team.jobs.messages import dumps, loads
 from sb3_belief.team.jobs.updating import modules_of, pack, raise_failure, show, tell, write_buffer, write_changes
 from sb3_belief.team.jobs.workers import Workers

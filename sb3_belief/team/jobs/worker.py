@@ -6,7 +6,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from sb3_belief.team.jobs.arrived import Before, Recorder, captured, failure_of, rebuild
-from sb3_belief.team.jobs.branch import Branch
+from sb3_belief.team.jobs.host import Host
 from sb3_belief.team.jobs.messages import Message, dumps, receive, send
 from sb3_belief.team.jobs.updating import read_stream
 from sb3_belief.team.processes import leave_interrupts_to_main
@@ -24,12 +24,12 @@ def serve(connection: Connection) -> None:
     results: queue.SimpleQueue[tuple[Any, Any]] = queue.SimpleQueue()
     threading.Thread(target=_receive_jobs, args=(connection, jobs), daemon=True).start()
     threading.Thread(target=_send_results, args=(connection, results), daemon=True).start()
-    branch = Branch()
+    host = Host()
     while (given := jobs.get()) is not None:
         agent, job = given
         if agent is not None:
             results.put((agent, update(job)))
-        elif (done := branch.do(job)) is not None:
+        elif (done := host.do(job)) is not None:
             results.put((None, done))
 
 

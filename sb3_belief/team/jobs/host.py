@@ -34,7 +34,7 @@ class Arriving(NamedTuple):
 
 class Order(NamedTuple):
     """
-    :param method: of ``BranchHub``, or one of ``Branch``
+    :param method: of ``BranchHub``, or one of ``Host``
     :param args: of the method
     :param is_answered: whether it has an answer; otherwise another order follows, which has
     """
@@ -66,8 +66,8 @@ def state_of(wrapper: VecEnvWrapper) -> dict[str, Any]:
     return {name: value for name, value in vars(wrapper).items() if name not in _OF_ITS_PLACE}
 
 
-class Branch:
-    """One part of a team after another learns here, each from ``open`` to ``close``."""
+class Host:
+    """One branch of a team after another learns here, each from ``open`` to ``close``."""
 
     def __init__(self) -> None:
         self._found = _nothing()
@@ -153,28 +153,31 @@ class Branch:
 
     def look(self) -> None:
         """Say how the models are."""
-        self._found["changes"] = self._changes(with_buffers=False)
+        self._find_changes(with_buffers=False)
 
     def close(self) -> None:
         """End what is under way, and say how the models are."""
         try:
             if self._hub is not None:
                 self._hub.stop()
-                self._found["changes"] = self._changes(with_buffers=True)
+                self._find_changes(with_buffers=True)
         finally:
             self._stack.close()
             self._hub = None
 
-    def _changes(self, with_buffers: bool) -> dict[str, Any]:
-        return {
-            agent: {
-                "model": before.changes(),
-                "wrappers": [state_of(wrapper) for wrapper in wrappers_of(self._models[agent].env)],  # type: ignore[arg-type]
-                "stream": self._streams[agent],
-                "buffer": before.buffer() if with_buffers else None,
-            }
-            for agent, before in self._before.items()
-        }
+    def _find_changes(self, with_buffers: bool) -> None:
+        for agent, before in self._before.items():
+            env = self._models[agent].env
+            try:
+                self._found["changes"][agent] = {
+                    "model": before.changes(),
+                    "wrappers": [state_of(wrapper) for wrapper in wrappers_of(env)],  # type: ignore[arg-type]
+                    "stream": self._streams[agent],
+                    "buffer": before.buffer() if with_buffers else None,
+                }
+            except Exception as error:
+                # The others are not lost with it
+                self._found.update(failure_of(error))
 
 
 def _nothing() -> dict[str, Any]:
