@@ -47,8 +47,8 @@ def test_steps_are_counted_as_they_were_done(written):
     together = [steps for (part, _), steps in rows.items() if part == "together"]
     assert together == [[8] * n for n in (3, 4, 3, 4)] + [[4] * n for n in (3, 4, 3, 4)]
     if cores() > 1:
-        assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [4 * 8]
-        assert rows["cores", "2 teams"] == [2 * 4 * 8]
+        assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [3 * 4 * 8]
+        assert rows["cores", "2 teams"] == [2 * 3 * 4 * 8]
     for n in (5, 20):
         for kind in ("fixed others", "all learn", "no belief"):
             assert rows["agents", f"{n} agents, {kind}"] == [n * AGENT_STEPS]
