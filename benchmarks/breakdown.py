@@ -24,6 +24,7 @@ from sb3_belief.belief_ppo import algorithm
 from sb3_belief.team.joint_env import JointEnv
 from sb3_belief.team.parallel_vec_env import ParallelTeamVecEnv
 from sb3_belief.team.stacking import networks, passes
+from sb3_belief.team.views import AgentPart
 
 UPDATE = "update"
 
@@ -81,7 +82,8 @@ class Clocks(ExitStack):
         else:
             self.wrap(env, "_step_joint", "environment")
         self.wrap(env, "step", "transfer")
-        self.wrap(team._hub._views, "split", "transfer")
+        self.wrap(team._hub._views, "parts", "transfer")
+        self.wrap(AgentPart, "as_step", "transfer")
         for model in team.agents.values():
             self._wrap_model(model)
         # Policies with equal networks act together

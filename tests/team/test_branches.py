@@ -20,6 +20,7 @@ from stable_baselines3.common.callbacks import (
 )
 
 from sb3_belief import BeliefPPO
+from sb3_belief.team.jobs import workers
 from sb3_belief.team.jobs.branches import leaves_models_alone
 from tests.team.helpers import Record, Team, make_team_env, parameters
 from tests.team.test_jobs import (
@@ -322,3 +323,28 @@ def test_a_model_that_cannot_come_back_does_not_keep_others():
                 team.learn(48)
         learned.append([parameters(team.agents[agent]) for agent in ("agent_1", "agent_2")])
     assert all(th.equal(one, two) for one, two in zip(*learned, strict=True))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("way", ["receive", "send"])
+def test_ctrl_c_within_a_message(way, monkeypatch):
+    """What comes after half a message cannot be read."""
+    calls, whole = [], getattr(workers, way)
+
+    def half(connection, *args):
+        calls.append(way)
+        if len(calls) == 12:
+            connection.send_bytes(b"half") if way == "send" else connection.recv_bytes()
+            raise KeyboardInterrupt
+        return whole(connection, *args)
+
+    team = toy_team(PPO, 2, **PPO_SMALL)
+    before = parameters(team.agents["agent_0"])
+    monkeypatch.setattr(workers, way, half)
+    with pytest.raises(KeyboardInterrupt):
+        team.learn(64)
+    assert len(calls) == 12 and no_processes_stay()
+    # What was in that process is lost, what was here is not, and the team can go on
+    assert th.equal(before, parameters(team.agents["agent_0"])) and team.agents["agent_1"].num_timesteps > 16
+    monkeypatch.undo()
+    assert not th.equal(before, parameters(team.learn(16).agents["agent_0"]))

@@ -82,7 +82,7 @@ class Workers:
         while agent not in worker.arrived:
             try:
                 worker.inbox.wait()
-            except EOFError as error:
+            except (EOFError, OSError) as error:
                 raise self._death(number) from error
             try:
                 whose, result = receive(worker.connection)
