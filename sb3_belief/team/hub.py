@@ -153,6 +153,17 @@ class Hub(ABC):
             streams.to(member.stream)
             self._resume(agent, Barrier(self, agent, member.callback))
 
+    def _hand_out(self, parts: dict[str, AgentPart]) -> None:
+        """
+        :param parts: of a joint step, which the agents are given when it is their turn
+        """
+        self._parts = parts
+        self._obs = {agent: part.obs for agent, part in parts.items()}
+        self._starts = {agent: part.dones for agent, part in parts.items()}
+
+    def _learning(self) -> list[str]:
+        return [agent for agent, member in self._members.items() if member.state != FINISHED]
+
     def _take_turns(self, agents: Iterable[str], streams: StreamSwitch) -> None:
         """Each in its own random stream."""
         for agent in agents:

@@ -14,12 +14,11 @@ each process there is one thread and one order: the team's. So runs are determin
 of its own (``RandomStream``), and so does what runs in the hub: the environment in this process and the team's callbacks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from typing import Protocol
 
 import numpy as np
-from greenlet import getcurrent
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.team.hub import Hub
@@ -104,6 +103,8 @@ class Lockstep(Hub):
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
         self._branches: Sequence[Branch] = ()
+        #: Who learns in them
+        self._elsewhere: set[str] = set()
         self._in_round = False
         self.n_steps = 0
         super().__init__(
@@ -161,7 +162,7 @@ class Lockstep(Hub):
         :raises BaseException: whatever one of them raised, after all others were stopped
         """
         self._members = {agent: members[agent] for agent in self.possible_agents}
-        self._branches = branches
+        self._branches, self._elsewhere = branches, {agent for branch in branches for agent in branch.agents}
         self.n_steps, self.n_rounds = 0, 0
         # Without any callback nobody could see who has counted a step, nor stop the others: then the second stop is left out
         self._vote = observer.has_callback or any(member.callback is not None for member in members.values())
@@ -178,18 +179,16 @@ class Lockstep(Hub):
                     )
                     raise
         finally:
-            self._main, self._members, self._branches, self._in_round = None, {}, (), False
+            self._main, self._members, self._in_round = None, {}, False
+            self._branches, self._elsewhere = (), set()
             self._parts, self._actions = {}, {}
 
     def _run(self, observer: Observer, stream: RandomStream, streams: StreamSwitch) -> bool:
         members = self._members
-        elsewhere = {agent for branch in self._branches for agent in branch.agents}
-        here = [agent for agent in members if agent not in elsewhere]
         for branch in self._branches:
             first = {agent: self._first.pop(agent) for agent in branch.agents if agent in self._first}
             branch.start(first, self.masks, self._vote)
-        self._main = getcurrent()
-        self._start(here, streams)
+        self._start(self._here(members), streams)
         self._join()
         # Who has ended a rollout since the team's last one ended
         ended: set[str] = set()
@@ -200,11 +199,11 @@ class Lockstep(Hub):
             self._await_actions(streams)
             all_together = len(learning) == len(members)
             if not all_together:
-                self._let_finished_act(elsewhere, streams)
+                self._let_finished_act(streams)
             streams.to(stream)
             actions = {agent: np.asarray(self._actions[agent]) for agent in members}
             step = self._step(actions)
-            learning_here = [agent for agent in learning if agent not in elsewhere]
+            learning_here = self._here(learning)
             for agent in learning_here if self._vote else ():
                 # Only the user's callbacks may draw random numbers here; without them the exchange of streams is spared
                 if members[agent].callback is not None:
@@ -225,8 +224,8 @@ class Lockstep(Hub):
                 learning = self._learning()
         return self._go_on and all_together
 
-    def _learning(self) -> list[str]:
-        return [agent for agent, member in self._members.items() if member.state != FINISHED]
+    def _here(self, agents: Iterable[str]) -> list[str]:
+        return [agent for agent in agents if agent not in self._elsewhere]
 
     def _all_act(self, agents: Sequence[str]) -> bool:
         return all(self._members[agent].state in (ACTS, ACTS_HERE) for agent in agents)
@@ -239,15 +238,14 @@ class Lockstep(Hub):
             for agent, state in states.items():
                 self._members[agent].state = state
 
-    def _let_finished_act(self, elsewhere: set[str], streams: StreamSwitch) -> None:
+    def _let_finished_act(self, streams: StreamSwitch) -> None:
         finished = [agent for agent, member in self._members.items() if member.state == FINISHED]
         for branch in self._branches:
             theirs = [agent for agent in finished if agent in branch.agents]
             if theirs:
                 branch.act(theirs)
-        for agent in finished:
-            if agent not in elsewhere:
-                self._act(agent, streams)
+        for agent in self._here(finished):
+            self._act(agent, streams)
         self._join()
 
     def _end_rollouts(self, ended: set[str], observer: Observer, stream: RandomStream, streams: StreamSwitch) -> None:
@@ -260,12 +258,10 @@ class Lockstep(Hub):
             observer.on_rollout_end()
         # Whoever is updated goes on to its next action at once
         self._in_round, self.n_rounds = True, self.n_rounds + 1
-        turns = now
         for branch in self._branches:
-            turns = [agent for agent in turns if agent not in branch.agents]
-            if any(agent in branch.agents for agent in now):
+            if not set(now).isdisjoint(branch.agents):
                 branch.end_rollouts()
-        now = turns
+        turns = now = self._here(now)
         while turns:
             self._take_turns(turns, streams)
             # With updates in several processes: first who is updated here, while the workers are busy, then all in their order
@@ -285,9 +281,7 @@ class Lockstep(Hub):
         step: TeamStep = self.env.step(actions)  # type: ignore[arg-type, assignment]
         self._masks_known = False
         parts = self._views.parts(actions, step)
-        self._parts = dict(zip(self.possible_agents, parts, strict=True))
-        self._obs = step[0]
-        self._starts = {agent: part.dones for agent, part in self._parts.items()}
+        self._hand_out(dict(zip(self.possible_agents, parts, strict=True)))
         for branch in self._branches:
             branch.step(self._parts, self.masks)
         return step

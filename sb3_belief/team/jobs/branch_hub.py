@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.team.hub import Hub
-from sb3_belief.team.members import FINISHED, ROLLOUT_ENDED, Member
+from sb3_belief.team.members import ROLLOUT_ENDED, Member
 from sb3_belief.team.streams import RandomStream, StreamSwitch
 from sb3_belief.team.vec_env import TeamObs
 from sb3_belief.team.views import AgentPart
@@ -51,9 +51,7 @@ class BranchHub(Hub):
         :param parts: of the agents
         :param masks: of the agents, if there are any
         """
-        self._parts = parts
-        self._obs = {agent: part.obs for agent, part in parts.items()}
-        self._starts = {agent: part.dones for agent, part in parts.items()}
+        self._hand_out(parts)
         self._given_masks, self._go_on = masks, True
         if self._vote:
             for agent in self._learning():
@@ -102,9 +100,6 @@ class BranchHub(Hub):
         moved, self._moved = self._moved, set()
         states = {agent: self._members[agent].state for agent in moved}
         return states, {agent: self._actions[agent] for agent in moved if agent in self._actions}
-
-    def _learning(self) -> list[str]:
-        return [agent for agent, member in self._members.items() if member.state != FINISHED]
 
     def _end_turns(self, moved: Iterable[str]) -> None:
         self._await_actions(self._streams)

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
 from sb3_belief.team.jobs.host import Arriving, Order, state_of, wrappers_of
 from sb3_belief.team.jobs.messages import dumps, loads
-from sb3_belief.team.jobs.updating import modules_of, pack, raise_failure, show, tell, write_buffer, write_changes
+from sb3_belief.team.jobs.updating import modules_of, pack_of, raise_failure, show, tell, write_buffer, write_changes
 from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.team.streams import RandomStream
 from sb3_belief.team.vec_env import TeamObs
@@ -63,10 +63,7 @@ def can_learn_elsewhere(model: BaseAlgorithm, hub: "Lockstep", agent: str) -> bo
             return False
     if any(vars(module)[hooks] for _, module in modules_of(model) for hooks in _HOOKS):
         return False
-    env = model.env
-    for wrapper in wrappers_of(env):  # type: ignore[arg-type]
-        env = wrapper.venv
-    return env is hub.agent_envs[agent]
+    return model.env is not None and model.env.unwrapped is hub.agent_envs[agent]
 
 
 class RemoteBranch:
@@ -132,7 +129,7 @@ class RemoteBranch:
 
     def _arriving(self, agent: str) -> Arriving:
         model = self._models[agent]
-        wrappers = [(type(wrapper), state_of(wrapper)) for wrapper in wrappers_of(model.env)]  # type: ignore[arg-type]
+        wrappers = [(type(wrapper), state_of(wrapper)) for wrapper in wrappers_of(model.env)]
         return Arriving(pack_of(agent, model), wrappers, self._streams[agent])
 
     def step(self, parts: dict[str, AgentPart], masks: TeamObs | None) -> None:
@@ -193,22 +190,9 @@ class RemoteBranch:
         for agent, changes in answer["changes"].items():
             model = self._models[agent]
             write_changes(model, changes["model"])
-            for wrapper, state in zip(wrappers_of(model.env), changes["wrappers"], strict=True):  # type: ignore[arg-type]
+            for wrapper, state in zip(wrappers_of(model.env), changes["wrappers"], strict=True):
                 vars(wrapper).update({key: value for key, value in state.items() if not isinstance(value, spaces.Space)})
             self._streams[agent].become(changes["stream"])
             if changes["buffer"] is not None:
                 write_buffer(model, changes["buffer"])
         raise_failure(answer)
-
-
-def pack_of(agent: str, model: BaseAlgorithm) -> Any:
-    """
-    :param agent: whose model it is
-    :param model: the model
-    :return: the same as a message
-    :raises ValueError: if it cannot be one
-    """
-    try:
-        return pack(model)
-    except ValueError as error:
-        raise ValueError(f"Agent {agent!r} cannot be updated in another process. {error}") from error

@@ -44,11 +44,13 @@ class Order(NamedTuple):
     is_answered: bool = True
 
 
+# Orders that are also about the models; the others are the hub's
+_OWN = ("open", "end_rollouts", "look", "close")
 # Of a wrapper, what belongs to where it is
 _OF_ITS_PLACE = ("venv", "class_attributes")
 
 
-def wrappers_of(env: VecEnv) -> Iterator[VecEnvWrapper]:
+def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
     """
     :param env: of a model
     :return: what is around the agent's own environment, the outermost first
@@ -92,14 +94,8 @@ class Host:
         with captured(self._found):
             try:
                 method, args, is_answered = loads(order) if isinstance(order, Message) else order
-                own: dict[str, Callable[..., None]] = {
-                    "open": self.open,
-                    "end_rollouts": self.end_rollouts,
-                    "look": self.look,
-                    "close": self.close,
-                }
-                if method in own:
-                    own[method](*args)
+                if method in _OWN:
+                    getattr(self, method)(*args)
                 elif self._found["error"] is None:
                     getattr(self._hub, method)(*args)
             except BaseException as error:
@@ -171,7 +167,7 @@ class Host:
             try:
                 self._found["changes"][agent] = {
                     "model": before.changes(),
-                    "wrappers": [state_of(wrapper) for wrapper in wrappers_of(env)],  # type: ignore[arg-type]
+                    "wrappers": [state_of(wrapper) for wrapper in wrappers_of(env)],
                     "stream": self._streams[agent],
                     "buffer": before.buffer() if with_buffers else None,
                 }

@@ -94,7 +94,7 @@ def _recall(known: Any) -> Any:
 def send(connection: Connection, agent: str | None, content: Any) -> None:
     """
     :param connection: to the other process
-    :param agent: whom it is about; None for several
+    :param agent: whom it is about; None for a branch
     :param content: a ``Message``, or something small without tensors, whose pickle does not need one
     """
     if not isinstance(content, Message):

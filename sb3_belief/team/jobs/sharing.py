@@ -16,8 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_belief.team.jobs.branches import RemoteBranch, can_learn_elsewhere, leaves_models_alone, pack_of
-from sb3_belief.team.jobs.updating import REPLACED, read_stream, unpack_result, write_stream
+from sb3_belief.team.jobs.branches import RemoteBranch, can_learn_elsewhere, leaves_models_alone
+from sb3_belief.team.jobs.updating import REPLACED, pack_of, read_stream, unpack_result, write_stream
 from sb3_belief.team.jobs.workers import Workers
 from sb3_belief.team.members import UPDATES, UPDATES_HERE, Member
 from sb3_belief.team.stacking import acting_together
@@ -92,13 +92,13 @@ class Jobs:
         workers = {agent: i % n_processes if (i + 1) % n_processes else None for i, agent in enumerate(shared)}
         away: dict[int, dict[str, BaseAlgorithm]] = {}
         for agent, worker in workers.items() if leaves_models_alone(callback) else ():
-            alone = members[agent].callback is None and can_learn_elsewhere(models[agent], hub, agent)
-            if worker is not None and alone:
+            can_go = members[agent].callback is None and can_learn_elsewhere(models[agent], hub, agent)
+            if worker is not None and can_go:
                 away.setdefault(worker, {})[agent] = models[agent]
         gone = {agent for those in away.values() for agent in those}
-        if n_processes > 1:
-            self._start({agent: models[agent] for agent in shared}, n_processes - 1)
         updated = {agent: worker for agent, worker in workers.items() if n_processes > 1 and agent not in gone}
+        if n_processes > 1:
+            self._start({agent: models[agent] for agent in updated}, n_processes - 1)
         try:
             for agent, worker in updated.items():
                 self._share_update(hub, agent, models[agent], worker)

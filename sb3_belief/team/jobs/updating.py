@@ -112,6 +112,19 @@ def pack(model: BaseAlgorithm) -> Message:
         ) from error
 
 
+def pack_of(agent: str, model: BaseAlgorithm) -> Message:
+    """
+    :param agent: whose model it is
+    :param model: the model
+    :return: the same as a message
+    :raises ValueError: if it cannot be one
+    """
+    try:
+        return pack(model)
+    except ValueError as error:
+        raise ValueError(f"Agent {agent!r} cannot be updated in another process. {error}") from error
+
+
 def _can_pickle(value: Any, known: dict[int, Any]) -> bool:
     try:
         dumps(value, known)

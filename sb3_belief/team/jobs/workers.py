@@ -36,22 +36,19 @@ class Workers:
     def __len__(self) -> int:
         return len(self._all)
 
-    def start(self, n: int) -> bool:
+    def start(self, n: int) -> None:
         """
         :param n: how many there are to be
-        :return: whether any was started
         """
         if any(not worker.process.is_alive() for worker in self._all):
             self.end()
         context = start_context()
-        missing = range(len(self._all), n)
-        for i in missing:
+        for i in range(len(self._all), n):
             here, there = context.Pipe()
             process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
             process.start()
             there.close()
             self._all.append(_Worker(process, here, Inbox(here, process), {}, {}))
-        return len(missing) > 0
 
     def send(self, number: int, agent: str | None, job: Any, whose: str = "") -> None:
         """
