@@ -17,7 +17,7 @@ from benchmarks.measure import Sample, Spread, spread
 from benchmarks.report import Report
 from benchmarks.teams import ALGOS, TeamLoop, junction_team, spread_team
 from sb3_belief import Team
-from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.team.lockstep.joint_loop import JointLoop
 
 TOGETHER, APART = "together", "each by itself"
 
@@ -37,7 +37,7 @@ class TurnsLoop(TeamLoop):
         self.rollouts: list[dict[str, list[Sample]]] = []
 
     def __call__(self) -> int:
-        step, end_rollouts, chooses_actions = Lockstep._step, Lockstep._end_rollouts, Lockstep.chooses_actions
+        step, end_rollouts, chooses_actions = JointLoop._step, JointLoop._end_rollouts, JointLoop.chooses_actions
         samples: dict[str, list[Sample]] = defaultdict(list)
         # When the last step of the environment was done; None after an update, whose time is not to be counted
         since: tuple[float, float] | None = None
@@ -45,29 +45,29 @@ class TurnsLoop(TeamLoop):
         def now() -> tuple[float, float]:
             return time.process_time(), time.perf_counter()
 
-        def timed_step(hub: Lockstep, actions: Any) -> Any:
+        def timed_step(scheduler: JointLoop, actions: Any) -> Any:
             nonlocal since
             if since is not None:
                 cpu, wall = now()
-                samples[self._way].append(Sample(hub.num_envs, cpu - since[0], wall - since[1]))
-            result = step(hub, actions)
+                samples[self._way].append(Sample(scheduler.num_envs, cpu - since[0], wall - since[1]))
+            result = step(scheduler, actions)
             self._way = next(self._ways)
             since = now()
             return result
 
-        def untimed_end(hub: Lockstep, *args: Any) -> None:
+        def untimed_end(scheduler: JointLoop, *args: Any) -> None:
             nonlocal since
-            end_rollouts(hub, *args)
+            end_rollouts(scheduler, *args)
             since = None
 
         # A policy that cannot wait for others acts by itself
-        def can_wait(hub: Lockstep, agent: str) -> bool:
-            return self._way == TOGETHER and chooses_actions(hub, agent)
+        def can_wait(scheduler: JointLoop, agent: str) -> bool:
+            return self._way == TOGETHER and chooses_actions(scheduler, agent)
 
         with (
-            mock.patch.object(Lockstep, "_step", timed_step),
-            mock.patch.object(Lockstep, "_end_rollouts", untimed_end),
-            mock.patch.object(Lockstep, "chooses_actions", can_wait),
+            mock.patch.object(JointLoop, "_step", timed_step),
+            mock.patch.object(JointLoop, "_end_rollouts", untimed_end),
+            mock.patch.object(JointLoop, "chooses_actions", can_wait),
         ):
             steps = super().__call__()
         self.rollouts.append(dict(samples))

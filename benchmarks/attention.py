@@ -46,9 +46,9 @@ def compare(sizes: tuple[int, int, int, int], rounds: int) -> tuple[dict[str, fl
     :return: milliseconds of each way, and the largest difference between any two
     """
     th.manual_seed(0)
-    n_queries, n_rows, n_kept, width = sizes
+    n_queries, n_rows, n_selected, width = sizes
     inputs = [(width**-0.25 * th.randn(n, width)).requires_grad_() for n in (n_queries, n_rows)]
-    kept = th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices.sort(dim=1).values.int()
+    kept = th.rand(n_queries, n_rows).topk(n_selected, dim=1).indices.sort(dim=1).values.int()
     upstream = th.randn(n_queries, width)
 
     def run(way: Attention) -> list[th.Tensor]:

@@ -21,10 +21,10 @@ from benchmarks.report import Report
 from benchmarks.teams import TeamLoop
 from sb3_belief import Team
 from sb3_belief.belief_ppo import algorithm
-from sb3_belief.team.joint_env import JointEnv
-from sb3_belief.team.parallel_vec_env import ParallelTeamVecEnv
-from sb3_belief.team.stacking import networks, passes
-from sb3_belief.team.views import AgentPart
+from sb3_belief.team.batched_forward import networks, passes
+from sb3_belief.vec_env.agent_step import AgentTransition
+from sb3_belief.vec_env.joint_env import JointEnv
+from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 
 UPDATE = "update"
 
@@ -71,8 +71,8 @@ class Clocks(ExitStack):
         """
         :param team: whose work to time
         """
-        assert team._hub is not None
-        env = team._hub.env.unwrapped
+        assert team._scheduler is not None
+        env = team._scheduler.env.unwrapped
         if isinstance(env, ParallelTeamVecEnv):
             assert isinstance(env.venv, DummyVecEnv)
             for joint in env.venv.envs:
@@ -82,12 +82,12 @@ class Clocks(ExitStack):
         else:
             self.wrap(env, "_step_joint", "environment")
         self.wrap(env, "step", "transfer")
-        self.wrap(team._hub._views, "parts", "transfer")
-        self.wrap(AgentPart, "as_step", "transfer")
+        self.wrap(team._scheduler._views, "parts", "transfer")
+        self.wrap(AgentTransition, "as_step", "transfer")
         for model in team.agents.values():
             self._wrap_model(model)
         # Policies with equal networks act together
-        for owner, method in ((passes.Part, "prepare"), (passes, "make"), (passes.Part, "finish")):
+        for owner, method in ((passes.ForwardRequest, "prepare"), (passes, "make"), (passes.ForwardRequest, "finish")):
             self.wrap(owner, method, "policy")
         self.wrap(networks.StackedNetworks, "believe", "belief")
         self.wrap(th.Tensor, "backward", "backward")

@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 
 from benchmarks.teams import SPREAD
 from sb3_belief.team import make_team_env
-from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.team.lockstep.joint_loop import JointLoop
 
 Advance = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, dict[int, dict[str, np.ndarray]]]
 
@@ -36,10 +36,10 @@ class ByHandOnTeamEnv:
         self.env = make_team_env(SPREAD, n_envs=n_envs, seed=0)
         self.agents = self.env.possible_agents
         # Only for the models' spaces; it is never stepped
-        hub = Lockstep(make_team_env(SPREAD, n_envs=n_envs))
+        scheduler = JointLoop(make_team_env(SPREAD, n_envs=n_envs))
         self.models: dict[str, PPO] = {}
         for k, agent in enumerate(self.agents):
-            model = PPO("MlpPolicy", hub.agent_envs[agent], seed=k, device="cpu", **settings)
+            model = PPO("MlpPolicy", scheduler.agent_envs[agent], seed=k, device="cpu", **settings)
             model.set_logger(Logger(None, []))
             self.models[agent] = model
         self.obs = self._reset()

@@ -18,7 +18,7 @@ from benchmarks.report import Report
 from benchmarks.teams import TeamLoop, junction_team
 from benchmarks.told import Told
 from sb3_belief import Team
-from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.team.lockstep.joint_loop import JointLoop
 
 _KEY, _CONTROL = "two_cores_vs_one", "two_processes_vs_one"
 # In each learn(), since with several jobs models travel at its beginning and its end
@@ -47,7 +47,7 @@ class _PhasesLoop(TeamLoop):
         self.updates: list[float] = []
 
     def __call__(self) -> int:
-        end_rollouts, seconds = Lockstep._end_rollouts, []
+        end_rollouts, seconds = JointLoop._end_rollouts, []
 
         def timed(*args: Any) -> None:
             start = time.perf_counter()
@@ -55,7 +55,7 @@ class _PhasesLoop(TeamLoop):
             seconds.append(time.perf_counter() - start)
 
         start = time.perf_counter()
-        with mock.patch.object(Lockstep, "_end_rollouts", timed):
+        with mock.patch.object(JointLoop, "_end_rollouts", timed):
             steps = super().__call__()
         self.updates.append(sum(seconds))
         self.rollouts.append(time.perf_counter() - start - sum(seconds))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from benchmarks.measure import Loop, Sample, Spread, alternate, cores, speeds, spread
-from sb3_belief import versions as package
+from sb3_belief.common import versions as package
 
 #: What each ratio should be: at least (or at most, or less than) the number
 BARS: dict[str, tuple[str, float]] = {

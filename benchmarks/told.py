@@ -5,7 +5,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from benchmarks.measure import Loop
-from sb3_belief.team.processes import start_context
+from sb3_belief.common.processes import start_context
 
 
 class Told:

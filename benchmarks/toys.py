@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_belief.team import TeamVecEnv
-from sb3_belief.team.vec_env import TeamObs, TeamStep
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 #: As wide as an observation of simple_spread's three agents, and as many actions
 WIDTH, N_ACTIONS, EPISODE = 18, 5, 25

@@ -2,8 +2,8 @@
 
 from sb3_belief import envs
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
+from sb3_belief.common.versions import __version__
 from sb3_belief.team import AgentEnv, Team, TeamVecEnv, make_team_env
-from sb3_belief.versions import __version__
 
 __all__ = [
     "AgentEnv",

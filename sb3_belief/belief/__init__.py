@@ -3,7 +3,7 @@
 from sb3_belief.belief.history import History, append_rows, empty_history
 from sb3_belief.belief.layout import ActionLayout
 from sb3_belief.belief.loss import ACTION_LOSSES, cross_entropy, expected_actions, kl_divergence, squared_error
-from sb3_belief.belief.network import SIMILARITIES, BeliefOutput, DynamicBelief, HistoryContext, n_kept
+from sb3_belief.belief.network import SIMILARITIES, BeliefOutput, DynamicBelief, HistoryContext, n_selected
 from sb3_belief.belief.variants import VARIANTS, Variant
 
 __all__ = [
@@ -21,6 +21,6 @@ __all__ = [
     "empty_history",
     "expected_actions",
     "kl_divergence",
-    "n_kept",
+    "n_selected",
     "squared_error",
 ]

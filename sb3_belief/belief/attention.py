@@ -14,7 +14,7 @@ with warnings.catch_warnings():
     th.sparse_csr_tensor(th.zeros(2, dtype=th.int), _none, th.zeros(0), size=(1, 1), check_invariants=False)
 
 
-def largest(values: th.Tensor, n: int) -> th.Tensor:
+def topk_indices(values: th.Tensor, n: int) -> th.Tensor:
     """
     :param values: ``[..., T]``, no gradient flows from them
     :param n: How many are wanted, at most T

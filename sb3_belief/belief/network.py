@@ -13,7 +13,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_belief.belief.attention import attend, largest
+from sb3_belief.belief.attention import attend, topk_indices
 from sb3_belief.belief.history import History
 from sb3_belief.belief.variants import VARIANTS
 
@@ -58,7 +58,7 @@ class HistoryContext(NamedTuple):
     values: th.Tensor
 
 
-def n_kept(keep_ratio: float, n_rows: int) -> int:
+def n_selected(keep_ratio: float, n_rows: int) -> int:
     """
     :param keep_ratio: ``p``, in (0, 1]
     :param n_rows: Number of filled history rows, at least 0
@@ -203,7 +203,7 @@ class DynamicBelief(nn.Module):
         """
         # The length of the present one changes nothing in the order, so only the rows' directions are needed
         similarity = self._compared(observations, embeddings) @ context.directions.mT
-        return largest(similarity, n_kept(self.keep_ratio, similarity.shape[-1]))
+        return topk_indices(similarity, n_selected(self.keep_ratio, similarity.shape[-1]))
 
     def _attend_to_states(self, embedding: th.Tensor, rows: History, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_belief.belief import n_kept
+from sb3_belief.belief import n_selected
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.options import LATENT_DIM, BeliefOptions
@@ -120,7 +120,7 @@ class BeliefAlgorithmMixin(_Algorithm):
             return {}
         return dict(
             noise_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM) if variant.samples else 0,
-            history_kept=n_kept(self.keep_ratio, self.history_length) if variant.attends else 0,
+            max_selected=n_selected(self.keep_ratio, self.history_length) if variant.attends else 0,
             others_width=layout.width,
             n_others=layout.n_others,
         )

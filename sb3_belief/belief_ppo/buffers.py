@@ -57,13 +57,13 @@ class BeliefBufferMixin(_Buffer):
         self,
         *args: Any,
         noise_dim: int = 0,
-        history_kept: int = 0,
+        max_selected: int = 0,
         others_width: int = 0,
         n_others: int = 0,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
-        self._widths = dict(noise=noise_dim, kept=history_kept, others_actions=others_width, others_visible=n_others)
+        self._widths = dict(noise=noise_dim, kept=max_selected, others_actions=others_width, others_visible=n_others)
         #: Told of every minibatch before SB3 gets its part of it
         self.on_minibatch: Callable[[BeliefMinibatch], None] | None = None
         super().__init__(*args, **kwargs)
@@ -77,7 +77,7 @@ class BeliefBufferMixin(_Buffer):
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
         self.active = np.ones(rows, dtype=bool)
         #: Rows attended to are as many in every step of a rollout, but grow with the history from one to the next
-        self._n_kept = 0
+        self._n_selected = 0
 
     def stage(self, active: np.ndarray, minibatch: BeliefMinibatch | None = None) -> None:
         """
@@ -89,9 +89,9 @@ class BeliefBufferMixin(_Buffer):
         self.active[self.pos] = active
         if minibatch is None:
             return
-        self._n_kept = minibatch.kept.shape[1]
+        self._n_selected = minibatch.kept.shape[1]
         self.noise[self.pos] = minibatch.noise.cpu().numpy()
-        self.kept[self.pos, :, : self._n_kept] = minibatch.kept.cpu().numpy()
+        self.kept[self.pos, :, : self._n_selected] = minibatch.kept.cpu().numpy()
         self.others_actions[self.pos] = minibatch.others_actions.numpy()
         self.others_visible[self.pos] = minibatch.others_visible.numpy()
 
@@ -162,7 +162,12 @@ class BeliefBufferMixin(_Buffer):
         :param rows: Index into the rows as they are ordered at present
         :return: The belief's part of these rows, on the buffer's device; for a slice it is a part of the buffer itself
         """
-        parts = self.noise[rows], self.kept[rows][..., : self._n_kept], self.others_actions[rows], self.others_visible[rows]
+        parts = (
+            self.noise[rows],
+            self.kept[rows][..., : self._n_selected],
+            self.others_actions[rows],
+            self.others_visible[rows],
+        )
         return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 

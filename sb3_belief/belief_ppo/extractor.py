@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
 from sb3_belief.belief_ppo.options import BeliefOptions
-from sb3_belief.belief_ppo.writes import Watch
+from sb3_belief.common.tensor_version import TensorVersions
 
 
 def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
@@ -68,7 +68,7 @@ class Passing:
     noise: th.Tensor | None = None
     acted_with: tuple[th.Tensor, th.Tensor] | None = None
     context: HistoryContext | None = None
-    context_of: Watch = field(default_factory=Watch)
+    context_of: TensorVersions = field(default_factory=TensorVersions)
 
 
 class BeliefExtractor(BaseFeaturesExtractor):

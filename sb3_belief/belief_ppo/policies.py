@@ -17,13 +17,13 @@ from torch import nn
 from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, DynamicBelief, History, expected_actions, kl_divergence
-from sb3_belief.belief_ppo.auxiliary import add_loss
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flat_observations
+from sb3_belief.belief_ppo.loss_injection import add_loss
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
 from sb3_belief.belief_ppo.terminal_values import TerminalValues
-from sb3_belief.belief_ppo.writes import count_writes
+from sb3_belief.common.tensor_version import count_fused_step
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
@@ -129,7 +129,7 @@ class BeliefPolicyMixin(_Policy):
         if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
             kwargs["optimizer_kwargs"] = _fast_adam(kwargs.get("optimizer_kwargs"))
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
-        self.optimizer.register_step_post_hook(count_writes)
+        self.optimizer.register_step_post_hook(count_fused_step)
         if self.has_belief and not self.share_features_extractor:
             raise ValueError(
                 "share_features_extractor=False would give the value a belief of its own; policy and value share the belief "
@@ -139,7 +139,7 @@ class BeliefPolicyMixin(_Policy):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         # A copied optimiser has no hooks
-        self.optimizer.register_step_post_hook(count_writes)
+        self.optimizer.register_step_post_hook(count_fused_step)
 
     # -- construction, within SB3's constructor ------------------------------------------------------------------------
 

@@ -1,16 +1,21 @@
 """Environments: a registry of ids, this package's own PettingZoo environments, and adapters to those of other packages."""
 
 from sb3_belief.envs.adapters.pettingzoo import to_parallel
-from sb3_belief.envs.checker import check_team_env
-from sb3_belief.envs.families import FAMILIES, Family
+from sb3_belief.envs.env_checker import check_team_env
 from sb3_belief.envs.registry import EnvSpec, make_batched_env, make_parallel_env, register, registered_ids, spec
+from sb3_belief.envs.suites import SUITES, Suite
 from sb3_belief.envs.switching_convention import SwitchingConvention
 from sb3_belief.envs.traffic_junction import TrafficJunction
 
+# Their first names, which stay
+FAMILIES, Family = SUITES, Suite
+
 __all__ = [
     "FAMILIES",
+    "SUITES",
     "EnvSpec",
     "Family",
+    "Suite",
     "SwitchingConvention",
     "TrafficJunction",
     "check_team_env",

@@ -3,7 +3,7 @@ The environments that have an id, and how users give theirs one.
 
 Four kinds of ids: this package's own games (``traffic-junction-medium``), what users register (``register``, or the entry
 point group ``sb3_belief.envs`` of an installed package), ``family/name`` for environments of other packages
-(``mpe/simple_spread_v3``, see ``families``), and ``module:callable`` for anything that can be imported.
+(``mpe/simple_spread_v3``, see ``suites``), and ``module:callable`` for anything that can be imported.
 
 Classes are named by ``"module:attribute"`` strings and imported when they are asked for, so that looking at the registry
 needs none of the optional packages that an environment may need.
@@ -16,14 +16,12 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib import metadata
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-from sb3_belief.envs.families import FAMILIES, Family, listed, load, nearest
+from pettingzoo import ParallelEnv
 
-if TYPE_CHECKING:  # imports point one way: the team room may import this module, never the other way round at run time
-    from pettingzoo import ParallelEnv
-
-    from sb3_belief.team.vec_env import TeamVecEnv
+from sb3_belief.envs.suites import SUITES, Suite, listed, load, nearest
+from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
 ENTRY_POINT_GROUP = "sb3_belief.envs"
 
@@ -48,10 +46,10 @@ class EnvSpec:
     """
 
     id: str
-    parallel: str | Callable[..., "ParallelEnv"]
+    parallel: str | Callable[..., ParallelEnv]
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     batched: str | None = None
-    family: Family | None = None
+    family: Suite | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kwargs", MappingProxyType(dict(self.kwargs)))
@@ -63,7 +61,7 @@ class EnvSpec:
         """
         return () if self.family is None else (self.id.partition("/")[2],)
 
-    def load(self) -> Callable[..., "ParallelEnv"]:
+    def load(self) -> Callable[..., ParallelEnv]:
         """
         :return: the callable that makes one copy; it takes ``leading`` and the keyword arguments
         :raises ModuleNotFoundError: if its package is not installed, with the line that installs it
@@ -86,7 +84,7 @@ class EnvSpec:
             raise ValueError(f"{self.id!r} is a {type(found).__name__}, not a callable that returns a PettingZoo ParallelEnv.")
         return found
 
-    def maker(self, **env_kwargs: Any) -> Callable[[], "ParallelEnv"]:
+    def maker(self, **env_kwargs: Any) -> Callable[[], ParallelEnv]:
         """
         :param env_kwargs: keyword arguments of the environment; they override those of the id
         :return: a callable that returns one copy each time; worker processes can be given it
@@ -174,7 +172,7 @@ def _check_id(id: str) -> None:
     if not isinstance(id, str) or not _ID.fullmatch(id):
         raise ValueError(f"{id!r} cannot be an id: allowed are letters, digits, '_', '.' and '-', with slashes between.")
     family = id.partition("/")[0]
-    if family in FAMILIES:
+    if family in SUITES:
         raise ValueError(f"The id {id!r} is of the family {family!r}: choose one that does not begin with {family + '/'!r}.")
 
 
@@ -219,7 +217,7 @@ def spec(id: str) -> EnvSpec:
     if _CALLABLE.fullmatch(id):
         return EnvSpec(id, id)
     prefix, slash, name = id.partition("/")
-    family = FAMILIES.get(prefix)
+    family = SUITES.get(prefix)
     if family is not None and name:
         return EnvSpec(id, family.make, batched=family.batched, family=family)
     if family is not None:
@@ -227,15 +225,15 @@ def spec(id: str) -> EnvSpec:
         known = f": {listed(names)}" if names else ""
         raise ValueError(f"{id!r} lacks the environment's name; its ids are {prefix + '/<name>'!r}{known}.")
     ids = registered_ids()
-    patterns = [f"{name}/<name>" for name in FAMILIES]
-    hint = nearest(prefix + slash, [f"{name}/" for name in FAMILIES]) if slash else nearest(id, ids)
+    patterns = [f"{name}/<name>" for name in SUITES]
+    hint = nearest(prefix + slash, [f"{name}/" for name in SUITES]) if slash else nearest(id, ids)
     raise ValueError(
         f"Unknown environment id {id!r}.{hint} Registered ids: {', '.join(ids)}. Families: {', '.join(patterns)}."
         " An environment of your own needs no id: pass a callable that returns a PettingZoo ParallelEnv, or 'module:callable'."
     )
 
 
-def make_parallel_env(id: str, **env_kwargs: Any) -> "ParallelEnv":
+def make_parallel_env(id: str, **env_kwargs: Any) -> ParallelEnv:
     """
     :param id: see ``spec``
     :param env_kwargs: keyword arguments of the environment; they override those of the id
@@ -246,7 +244,7 @@ def make_parallel_env(id: str, **env_kwargs: Any) -> "ParallelEnv":
     return spec(id).maker(**env_kwargs)()
 
 
-def make_batched_env(id: str, n_envs: int, **env_kwargs: Any) -> "TeamVecEnv | None":
+def make_batched_env(id: str, n_envs: int, **env_kwargs: Any) -> TeamVecEnv | None:
     """
     :param id: see ``spec``
     :param n_envs: number of copies

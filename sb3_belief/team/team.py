@@ -20,17 +20,17 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_belief.team.acting import PolicyState
-from sb3_belief.team.building import check_env, check_names, per_agent
-from sb3_belief.team.jobs import Jobs, check_jobs
-from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.common.rng import RngSwitch
+from sb3_belief.team.agent_models import AgentModels, team_rng
+from sb3_belief.team.arguments import check_env, check_names, per_agent
+from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
+from sb3_belief.team.lockstep.agent_task import AgentTask
+from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief.team.lockstep.progress import TeamProgress, as_callback
 from sb3_belief.team.logs import TeamLog
-from sb3_belief.team.members import Member
-from sb3_belief.team.progress import TeamProgress, as_callback
-from sb3_belief.team.roster import Roster, team_stream
-from sb3_belief.team.saving import read_team, spaces_manifest, write_team
-from sb3_belief.team.streams import StreamSwitch
-from sb3_belief.team.vec_env import TeamObs
+from sb3_belief.team.parallel import Jobs, check_jobs
+from sb3_belief.team.predictor import PolicyState
+from sb3_belief.vec_env.team_vec_env import TeamObs
 
 SelfTeam = TypeVar("SelfTeam", bound="Team")
 
@@ -86,21 +86,21 @@ class Team:
         **kwargs: Any,
     ):
         check_jobs(jobs)
-        hub = Lockstep(check_env(env))
-        agents = hub.possible_agents
+        scheduler = JointLoop(check_env(env))
+        agents = scheduler.possible_agents
         classes, policies = per_agent("algo_class", algo_class, agents), per_agent("policy", policy, agents)
         own_kwargs = agent_kwargs or {}
         check_names("agent_kwargs", own_kwargs, agents)
-        recipes = {agent: (classes[agent], policies[agent], {**kwargs, **own_kwargs.get(agent, {})}) for agent in agents}
-        roster = Roster.build(recipes, hub, seed, normalize, max(verbose - 1, 0), device)
-        self._setup(hub, roster, hub.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
+        specs = {agent: (classes[agent], policies[agent], {**kwargs, **own_kwargs.get(agent, {})}) for agent in agents}
+        models = AgentModels.build(specs, scheduler, seed, normalize, max(verbose - 1, 0), device)
+        self._setup(scheduler, models, scheduler.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
         if seed is not None:
             env.seed(seed)
 
     def _setup(
         self,
-        hub: Lockstep | None,
-        roster: Roster,
+        scheduler: JointLoop | None,
+        models: AgentModels,
         scripted: dict[str, str],
         seed: int | None,
         normalize: bool | dict[str, Any],
@@ -109,10 +109,10 @@ class Team:
         tensorboard_log: str | None,
         jobs: int,
     ) -> None:
-        self._hub = hub
-        self._roster = roster
+        self._scheduler = scheduler
+        self._models = models
         self._scripted = scripted
-        self.possible_agents = list(roster.models)
+        self.possible_agents = list(models.models)
         self.seed = seed
         self.normalize = normalize
         self.verbose = verbose
@@ -122,8 +122,8 @@ class Team:
         self._log_dir, self._tensorboard_log = log_dir, tensorboard_log
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
-        self._stream = team_stream(seed)
-        self._jobs = Jobs(roster.models, roster.streams, jobs)
+        self._stream = team_rng(seed)
+        self._jobs = Jobs(models.models, models.streams, jobs)
         self._learning = False
         # False when the agents' last observations are not all those of where the environment is now
         self._can_continue = False
@@ -136,23 +136,23 @@ class Team:
             who asks here, not for who has kept them
         """
         self._jobs.look()
-        return self._roster.models
+        return self._models.models
 
     @property
     def observation_space(self) -> spaces.Dict:
         """
         :return: the agents' observation spaces by agent
         """
-        if self._hub is not None:
-            return spaces.Dict(self._hub.observation_spaces)
-        return spaces.Dict({agent: model.observation_space for agent, model in self._roster.models.items()})
+        if self._scheduler is not None:
+            return spaces.Dict(self._scheduler.observation_spaces)
+        return spaces.Dict({agent: model.observation_space for agent, model in self._models.models.items()})
 
     @property
     def action_space(self) -> spaces.Dict:
         """
         :return: the agents' action spaces by agent
         """
-        return spaces.Dict({agent: model.action_space for agent, model in self._roster.models.items()})
+        return spaces.Dict({agent: model.action_space for agent, model in self._models.models.items()})
 
     @property
     def logger(self) -> Logger:
@@ -198,8 +198,8 @@ class Team:
         """
         if self._learning:
             raise RuntimeError("This team is learning already: learn() cannot be called by a callback or an agent of its own.")
-        hub = self._hub
-        if hub is None:
+        scheduler = self._scheduler
+        if scheduler is None:
             raise ValueError("This team has no environment to learn in: use set_env(), or Team.load(path, env=env).")
         own_callbacks = agent_callbacks or {}
         check_names("agent_callbacks", own_callbacks, self.possible_agents)
@@ -218,11 +218,11 @@ class Team:
                 log_interval=log_interval,
                 reset_num_timesteps=reset_num_timesteps,
             )
-            members = {
-                agent: Member(
+            tasks = {
+                agent: AgentTask(
                     learn=partial(learn, model),
-                    act=self._roster.actor(agent).go_on,
-                    stream=self._roster.streams[agent],
+                    act=self._models.actor(agent).go_on,
+                    stream=self._models.streams[agent],
                     callback=as_callback(own_callbacks[agent]) if own_callbacks.get(agent) is not None else None,
                 )
                 for agent, model in self.agents.items()
@@ -231,16 +231,18 @@ class Team:
             self._can_continue = False
             team_callback = as_callback(callback, progress_bar)
             progress = TeamProgress(self, team_callback, log)
-            with StreamSwitch(self._stream):
+            with RngSwitch(self._stream):
                 if fresh:
                     for model in self.agents.values():
                         model._last_obs = None
-                    hub.reset()
+                    scheduler.reset()
                 total = total_timesteps + self.num_timesteps
-                progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": hub.env})
-            with self._jobs.shared_out(hub, members, learn, team_callback) as branches:
-                in_step = hub.run(members, progress, self._stream, branches)
-            with StreamSwitch(self._stream):
+                progress.on_training_start(
+                    {"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": scheduler.env}
+                )
+            with self._jobs.shared_out(scheduler, tasks, learn, team_callback) as remote_groups:
+                in_step = scheduler.run(tasks, progress, self._stream, remote_groups)
+            with RngSwitch(self._stream):
                 progress.on_training_end()
             self._can_continue = in_step
         finally:
@@ -274,7 +276,7 @@ class Team:
         actions: TeamObs = {}
         states: dict[str, PolicyState] = {}
         for agent in self.possible_agents:
-            actions[agent], states[agent] = self._roster.actor(agent).predict(
+            actions[agent], states[agent] = self._models.actor(agent).predict(
                 observation[agent],
                 None if state is None else state[agent],
                 episode_start,
@@ -286,7 +288,7 @@ class Team:
     @property
     def takes_masks(self) -> bool:
         """Whether an agent's model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
-        return any(self._roster.actor(agent).takes_masks for agent in self.possible_agents)
+        return any(self._models.actor(agent).takes_masks for agent in self.possible_agents)
 
     def save(self, path: str | os.PathLike | io.BufferedIOBase) -> None:
         """
@@ -302,7 +304,7 @@ class Team:
             "normalize": self.normalize,
             **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
-        write_team(path, self.agents, self._roster.statistics, manifest)
+        write_team(path, self.agents, self._models.statistics, manifest)
 
     @classmethod
     def load(
@@ -329,13 +331,15 @@ class Team:
         """
         check_jobs(jobs)
         saved = read_team(path)
-        hub = None if env is None else Lockstep(check_env(env))
-        if hub is not None:
-            saved.check_env(hub.env, hub.possible_agents, hub.scripted)
+        scheduler = None if env is None else JointLoop(check_env(env))
+        if scheduler is not None:
+            saved.check_env(scheduler.env, scheduler.possible_agents, scheduler.scripted)
         seed = saved.manifest["seed"]
         team = cls.__new__(cls)
-        roster = Roster.load(saved, hub, seed=seed, device=device)
-        team._setup(hub, roster, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
+        models = AgentModels.load(saved, scheduler, seed=seed, device=device)
+        team._setup(
+            scheduler, models, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log, jobs
+        )
         team.num_timesteps = saved.manifest["num_timesteps"]
         if env is not None and seed is not None:
             env.seed(seed)
@@ -345,7 +349,7 @@ class Team:
         """
         :return: the team's environment, if it has one
         """
-        return None if self._hub is None else self._hub.env
+        return None if self._scheduler is None else self._scheduler.env
 
     def set_env(self, env: VecEnv) -> None:
         """
@@ -355,12 +359,12 @@ class Team:
         """
         if self._learning:
             raise RuntimeError("The environment of a team cannot be changed while it learns.")
-        hub = Lockstep(check_env(env))
-        if hub.possible_agents != self.possible_agents:
-            raise ValueError(f"The team has the agents {self.possible_agents}, the environment {hub.possible_agents}.")
-        if list(hub.scripted.items()) != list(self._scripted.items()):
+        scheduler = JointLoop(check_env(env))
+        if scheduler.possible_agents != self.possible_agents:
+            raise ValueError(f"The team has the agents {self.possible_agents}, the environment {scheduler.possible_agents}.")
+        if list(scheduler.scripted.items()) != list(self._scripted.items()):
             raise ValueError(
-                f"The team has learned with the scripted others {self._scripted}, the environment has {hub.scripted}."
+                f"The team has learned with the scripted others {self._scripted}, the environment has {scheduler.scripted}."
             )
         n_envs = next(iter(self.agents.values())).n_envs
         if env.num_envs != n_envs:
@@ -368,8 +372,8 @@ class Team:
                 f"The team's buffers are for {n_envs} copies, the environment has {env.num_envs}: save the team and use"
                 " Team.load(path, env=env), which makes new ones."
             )
-        self._roster.move(hub)
-        self._hub = hub
+        self._models.move(scheduler)
+        self._scheduler = scheduler
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """

@@ -15,7 +15,7 @@ from rich.table import Table
 from sb3_belief.envs import registry
 from sb3_belief.envs.traffic_junction.policies import Policy, RandomPolicy, RulePolicy, all_gas
 from sb3_belief.report.learning_curve import plot_learning_curve
-from sb3_belief.team.vec_env import TeamObs
+from sb3_belief.vec_env.team_vec_env import TeamObs
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 from sb3_belief.zoo.evaluate import Outcome, evaluate

@@ -1,7 +1,7 @@
 """``sb3-belief envs``: which environments there are, and whether one keeps the contract."""
 
-from sb3_belief.envs.families import FAMILIES
 from sb3_belief.envs.registry import registered_ids
+from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo.errors import ConfigError, unknown
 from sb3_belief.zoo.names import load_env
 from sb3_belief.zoo.yaml_data import parse_pairs
@@ -18,16 +18,16 @@ def list_envs(family: str | None = None) -> str:
     """
     if family is None:
         parts = [_block("Registered", registered_ids())]
-        parts += [_family(name) for name in FAMILIES]
+        parts += [_family(name) for name in SUITES]
         parts.append("<module>:<callable>\n  anything that returns a PettingZoo ParallelEnv (its package: --allow-package)")
         return "\n\n".join(parts)
-    if family not in FAMILIES:
-        raise unknown("envs list", "family", family, FAMILIES)
+    if family not in SUITES:
+        raise unknown("envs list", "family", family, SUITES)
     return _family(family, full=True)
 
 
 def _family(name: str, full: bool = False) -> str:
-    family = FAMILIES[name]
+    family = SUITES[name]
     if family.missing():
         return _block(f"{name}/<name>: not installed", [family.install, *([family.note] if family.note else [])])
     names = family.known_names()
@@ -55,7 +55,7 @@ def check_env(
     :return: whether nothing has to be changed
     :raises ConfigError: if there is no such environment
     """
-    from sb3_belief.envs.checker import check_team_env
+    from sb3_belief.envs.env_checker import check_team_env
 
     load_env(env_id, "envs check", extra_packages)
     try:

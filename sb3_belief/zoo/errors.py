@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from sb3_belief.envs import families
+from sb3_belief.envs import suites
 
 
 class ConfigError(ValueError):
@@ -15,7 +15,7 @@ def nearest(given: object, allowed: Iterable[str]) -> str:
     :param allowed: what could have been typed
     :return: `` Did you mean 'x'?`` (with the leading space), or nothing if no name is near
     """
-    return families.nearest(given, allowed, most=2, cutoff=0.5)
+    return suites.nearest(given, allowed, most=2, cutoff=0.5)
 
 
 def unknown(where: str, kind: str, given: object, allowed: Iterable[str]) -> ConfigError:

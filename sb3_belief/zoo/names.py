@@ -9,8 +9,8 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_belief.envs.families import FAMILIES
 from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
+from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo.errors import ConfigError, nearest, unknown
 
 #: Packages (or parts of them) that a dotted path in a YAML file may point into
@@ -124,9 +124,9 @@ def get_env(env_id: str, where: str) -> EnvSpec:
     try:
         return spec(env_id)
     except ValueError as error:
-        if "/" in env_id or env_id in FAMILIES:
+        if "/" in env_id or env_id in SUITES:
             raise ConfigError(f"{where}: {error}") from None
-        kinds = [*registered_ids(), *(f"{family}/<name>" for family in FAMILIES), "<module>:<callable>"]
+        kinds = [*registered_ids(), *(f"{family}/<name>" for family in SUITES), "<module>:<callable>"]
         raise unknown(where, "environment", env_id, kinds) from None
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_belief.envs.families import FAMILIES
-from sb3_belief.versions import versions
+from sb3_belief.common.versions import versions
+from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo.errors import ConfigError
 
 CONFIG = "config.yml"
@@ -112,7 +112,7 @@ def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
     :param env: the environment, after it has run: StarCraft II tells its version only then
     :return: {package: version} of the packages that it comes from, and what its own ``versions()`` says, if it has one
     """
-    family = FAMILIES.get(env_id.partition("/")[0])
+    family = SUITES.get(env_id.partition("/")[0])
     found: dict[str, str] = {}
     if family is not None:
         packages = metadata.packages_distributions()

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch as th
 
-from sb3_belief.belief.attention import attend, largest
+from sb3_belief.belief.attention import attend, topk_indices
 
 
 def plain(queries, keys, values, kept):
@@ -18,17 +18,17 @@ def plain(queries, keys, values, kept):
     return th.stack(means)
 
 
-def chosen(n_queries, n_rows, n_kept):
-    return th.rand(n_queries, n_rows).topk(n_kept, dim=1).indices.sort(dim=1).values.int()
+def chosen(n_queries, n_rows, n_selected):
+    return th.rand(n_queries, n_rows).topk(n_selected, dim=1).indices.sort(dim=1).values.int()
 
 
 @pytest.mark.parametrize("n_queries, n_rows, n_kept, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2)])
-def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_kept, width):
+def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_selected, width):
     th.manual_seed(0)
     queries, keys = (th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows))
     values = th.randn(n_rows, width + 1, dtype=th.float64, requires_grad=True)
     inputs = [queries, keys, values]
-    kept = chosen(n_queries, n_rows, n_kept)
+    kept = chosen(n_queries, n_rows, n_selected)
     assert th.autograd.gradcheck(lambda q, k, v: attend(q, k, v, kept)[0], inputs)
     upstream = th.randn(n_queries, width + 1, dtype=th.float64)
     found = th.autograd.grad(attend(queries, keys, values, kept)[0], inputs, upstream)
@@ -105,19 +105,19 @@ def test_nobody_is_told_of_sparse_tensors():
 @pytest.mark.parametrize("n", [0, 1, 3, 8])
 def test_the_largest_are_those_of_a_sort(n):
     values = th.randn(6, 8, generator=th.Generator().manual_seed(0), requires_grad=True)
-    found = largest(values, n)
+    found = topk_indices(values, n)
     assert found.shape == (6, n) and found.dtype == th.int and found.is_contiguous()
     assert found.equal(values.argsort(dim=1)[:, 8 - n :].sort(dim=1).values.int())
 
 
 @pytest.mark.parametrize("n_kept", [0, 3])
-def test_stacked_agents_attend_each_to_its_own_rows(n_kept):
+def test_stacked_agents_attend_each_to_its_own_rows(n_selected):
     th.manual_seed(0)
     queries, keys, values = th.randn(2, 5, 4), th.randn(2, 9, 4), th.randn(2, 9, 3)
-    kept = largest(queries @ keys.mT, n_kept)
+    kept = topk_indices(queries @ keys.mT, n_selected)
     assert all(
         th.equal(own, chosen_rows)
-        for own, chosen_rows in zip(kept, map(largest, queries @ keys.mT, [n_kept] * 2), strict=True)
+        for own, chosen_rows in zip(kept, map(topk_indices, queries @ keys.mT, [n_selected] * 2), strict=True)
     )
     with th.no_grad():
         without_graph = attend(queries, keys, values, kept)
@@ -126,11 +126,11 @@ def test_stacked_agents_attend_each_to_its_own_rows(n_kept):
     means, weights = attend(queries, keys, values, kept)
     for ours, theirs in zip(without_graph, (means, weights), strict=True):
         th.testing.assert_close(ours, theirs)
-    found = th.autograd.grad(means.square().sum(), [queries, keys, values]) if n_kept else ()
+    found = th.autograd.grad(means.square().sum(), [queries, keys, values]) if n_selected else ()
     for i in range(2):
         own = [part[i].detach().requires_grad_() for part in (queries, keys, values)]
         expected = attend(own[0], own[1], own[2], kept[i])
         th.testing.assert_close(means[i], expected[0])
         th.testing.assert_close(weights[i], expected[1])
-        for ours, theirs in zip(found, th.autograd.grad(expected[0].square().sum(), own) if n_kept else (), strict=True):
+        for ours, theirs in zip(found, th.autograd.grad(expected[0].square().sum(), own) if n_selected else (), strict=True):
             th.testing.assert_close(ours[i], theirs)

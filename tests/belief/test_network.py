@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_belief.belief import VARIANTS, DynamicBelief, History, empty_history, n_kept
+from sb3_belief.belief import VARIANTS, DynamicBelief, History, empty_history, n_selected
 
 D_O, W, D, Z = 6, 5, 8, 4
 
@@ -40,8 +40,8 @@ def test_while_the_history_is_empty_the_attention_is_not_trained(kept):
 @pytest.mark.parametrize("keep_ratio", [0.01, 0.05, 0.5, 1.0])
 def test_at_least_one_row_is_kept_and_at_most_all(keep_ratio):
     for n_rows in range(1, 50):
-        assert 1 <= n_kept(keep_ratio, n_rows) <= n_rows
-    assert n_kept(keep_ratio, 0) == 0 and n_kept(keep_ratio, 1000) == 1000 * keep_ratio
+        assert 1 <= n_selected(keep_ratio, n_rows) <= n_rows
+    assert n_selected(keep_ratio, 0) == 0 and n_selected(keep_ratio, 1000) == 1000 * keep_ratio
 
 
 PARTS = {

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -32,6 +33,7 @@ def test_a_team_loads_predicts_the_same_and_goes_on_learning():
     env = make_team_env(ENV_ID, n_envs=2, seed=1)
     team = Team.load(DATA / "team.zip", env=env)
     assert team.num_timesteps == 64 and team.normalize is True
+    model: Any
     for agent, model in team.agents.items():
         assert_same(outputs(model), EXPECTED["team"][agent])
         # The history came along, and so did the statistics of the normalisation

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from sb3_belief.envs import (
-    FAMILIES,
+    SUITES,
     EnvSpec,
     SwitchingConvention,
     TrafficJunction,
-    families,
     make_batched_env,
     make_parallel_env,
     register,
     registered_ids,
     spec,
+    suites,
 )
 from sb3_belief.envs import registry as registry_module
 from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
@@ -102,7 +102,7 @@ def own_registry(monkeypatch):
 
 
 def test_looking_at_the_registry_imports_no_package():
-    roots = sorted({module.partition(".")[0] for family in FAMILIES.values() for module in family.modules} - {"pettingzoo"})
+    roots = sorted({module.partition(".")[0] for family in SUITES.values() for module in family.modules} - {"pettingzoo"})
     code = (
         "import sys; from sb3_belief.envs import registry\n"
         "for family in registry.FAMILIES.values(): registry.spec(f'{family.name}/x'); family.missing()\n"
@@ -112,9 +112,9 @@ def test_looking_at_the_registry_imports_no_package():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("family", FAMILIES.values(), ids=lambda family: family.name)
+@pytest.mark.parametrize("family", SUITES.values(), ids=lambda family: family.name)
 def test_a_missing_package_is_named_with_the_line_that_installs_it(family, monkeypatch):
-    monkeypatch.setattr(families, "is_installed", lambda module: False)
+    monkeypatch.setattr(suites, "is_installed", lambda module: False)
     makers: list[Any] = [make_parallel_env, make_team_env]
     if family.batched is not None:
         makers.append(lambda id: make_batched_env(id, 2))
@@ -125,7 +125,7 @@ def test_a_missing_package_is_named_with_the_line_that_installs_it(family, monke
 
 
 def test_the_missing_smac_warns_of_the_other_project(monkeypatch):
-    monkeypatch.setattr(families, "is_installed", lambda module: False)
+    monkeypatch.setattr(suites, "is_installed", lambda module: False)
     with pytest.raises(ModuleNotFoundError, match="Not 'pip install smac', which installs another project"):
         make_parallel_env("smac/3m")
 
@@ -134,11 +134,11 @@ def test_the_other_project_called_smac_is_not_taken_for_it(tmp_path, monkeypatch
     (tmp_path / "smac").mkdir()
     (tmp_path / "smac" / "__init__.py").write_text("raise RuntimeError('imported')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    assert families.is_installed("smac") and not families.is_installed("smac.env.starcraft2")
+    assert suites.is_installed("smac") and not suites.is_installed("smac.env.starcraft2")
     (tmp_path / "smac" / "env" / "starcraft2").mkdir(parents=True)
     for folder in ("env", "env/starcraft2"):
         (tmp_path / "smac" / folder / "__init__.py").touch()
-    assert families.is_installed("smac.env.starcraft2") and "smac" not in sys.modules
+    assert suites.is_installed("smac.env.starcraft2") and "smac" not in sys.modules
 
 
 def test_a_module_and_a_callable_are_an_id():

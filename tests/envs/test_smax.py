@@ -15,7 +15,7 @@ from stable_baselines3.common import evaluation
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
 from sb3_belief.envs.adapters import smax
-from sb3_belief.envs.adapters.smax_vec_env import SmaxVecEnv
+from sb3_belief.envs.adapters.smax.vec_env import SmaxVecEnv
 
 pytestmark = pytest.mark.skipif(find_spec("jaxmarl") is None, reason="jaxmarl is not installed: run make test-smax")
 

@@ -12,7 +12,7 @@ from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.envs import SwitchingConvention, make_batched_env, make_parallel_env
 from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
 from sb3_belief.team import Team, make_team_env
-from sb3_belief.team.lockstep import Lockstep
+from sb3_belief.team.lockstep.joint_loop import JointLoop
 
 VARIANTS: list[dict[str, Any]] = [
     {},
@@ -89,14 +89,14 @@ def test_rewards_and_leader_step_by_step(kwargs):
 @pytest.mark.parametrize("leader_visible", [True, False])
 def test_the_followers_history_pairs_cues_with_what_the_leader_did_at_them(env_name, kwargs, leader_visible):
     env = make_team_env(env_name, 2, seed=0, env_kwargs={**kwargs, "leader_visible": leader_visible})
-    hub = Lockstep(env)
-    assert hub.agent_envs["follower"].get_attr("others_action_spaces") == [{"leader": spaces.Discrete(3)}] * 2
+    scheduler = JointLoop(env)
+    assert scheduler.agent_envs["follower"].get_attr("others_action_spaces") == [{"leader": spaces.Discrete(3)}] * 2
     obs = env.reset()["follower"]
     generator = np.random.default_rng(0)
     for _ in range(20):
         played = [int(convention[cue]) for convention, cue in zip(env.get_attr("convention"), obs, strict=True)]
         actions = {"follower": generator.integers(3, size=2)}
-        (part,) = hub._views.split(actions, env.step(actions))
+        (part,) = scheduler._views.split(actions, env.step(actions))
         for i in range(2):
             expected = np.eye(3)[played[i]] if leader_visible else np.zeros(3)
             assert part[3][i]["others_actions"].tolist() == expected.tolist()

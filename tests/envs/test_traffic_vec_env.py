@@ -5,9 +5,9 @@ import pytest
 from pettingzoo import ParallelEnv
 
 from sb3_belief.envs import TrafficJunction
+from sb3_belief.envs.env_util import make_team_env
 from sb3_belief.envs.traffic_junction.policies import all_gas, evaluate
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
-from sb3_belief.team.make import make_team_env
 
 VARIANTS = [
     {},

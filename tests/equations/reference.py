@@ -81,8 +81,8 @@ def similarities(weights: Weights, similarity: str, observation: np.ndarray, his
 
 def most_similar(similarity: list[float], keep_ratio: float) -> list[int]:
     """K of eq. 3: the share p of the rows, at least one, by falling similarity."""
-    n_kept = min(len(similarity), max(1, round(keep_ratio * len(similarity))))
-    return sorted(range(len(similarity)), key=lambda row: -similarity[row])[:n_kept]
+    n_selected = min(len(similarity), max(1, round(keep_ratio * len(similarity))))
+    return sorted(range(len(similarity)), key=lambda row: -similarity[row])[:n_selected]
 
 
 def scale(width: int) -> float:

@@ -7,7 +7,7 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_belief.belief_ppo import MaskableBeliefPPO
-from sb3_belief.belief_ppo.auxiliary import add_loss
+from sb3_belief.belief_ppo.loss_injection import add_loss
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model
 
 ALPHA, BETA = 0.5, 0.05

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_belief.team.roster import agent_seed
+from sb3_belief.team.agent_models import agent_seed
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv
 

@@ -7,8 +7,8 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn, optim
 
-from sb3_belief.envs.families import FAMILIES
 from sb3_belief.envs.registry import registered_ids
+from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo import config as config_module
 from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.config import REPO_CONFIGS, load_config
@@ -39,7 +39,7 @@ def committed(algo):
 
 @pytest.mark.parametrize("algo, env_id", [(algo, env_id) for algo in ALGOS for env_id in committed(algo)])
 def test_every_committed_entry_is_valid(algo, env_id):
-    family = FAMILIES.get(env_id.partition("/")[0])
+    family = SUITES.get(env_id.partition("/")[0])
     if family is not None and family.missing():
         pytest.skip(f"needs {' and '.join(family.missing())}")
     config = load_config(algo, env_id)

@@ -5,8 +5,8 @@ import sys
 import pytest
 import yaml
 
-from sb3_belief.envs import families
-from sb3_belief.envs.families import FAMILIES
+from sb3_belief.envs import suites
+from sb3_belief.envs.suites import SUITES
 from sb3_belief.team import Team
 from sb3_belief.zoo import envs
 from sb3_belief.zoo.cli import main, train_main
@@ -94,8 +94,8 @@ def test_ones_own_environment_is_trained_and_replayed(own_module, capsys):
 )
 def test_environments_that_are_refused(env_id, message, own_module, monkeypatch, capsys):
     missing = {"jaxmarl"}
-    is_installed = families.is_installed
-    monkeypatch.setattr(families, "is_installed", lambda module: module not in missing and is_installed(module))
+    is_installed = suites.is_installed
+    monkeypatch.setattr(suites, "is_installed", lambda module: module not in missing and is_installed(module))
     assert train(env_id, own_module / "logs") == 2
     assert message in capsys.readouterr().err
     assert "my_toys" not in sys.modules and not (own_module / "logs").exists()
@@ -136,14 +136,14 @@ def test_arguments_of_a_family_are_checked(capsys):
 
 
 def test_the_list_says_what_is_there_and_how_to_get_the_rest(monkeypatch, capsys):
-    is_installed = families.is_installed
-    monkeypatch.setattr(families, "is_installed", lambda module: not module.startswith("smac") and is_installed(module))
+    is_installed = suites.is_installed
+    monkeypatch.setattr(suites, "is_installed", lambda module: not module.startswith("smac") and is_installed(module))
     assert main(["envs"]) == 0
     said = capsys.readouterr().out
-    assert all(f"{name}/<name>: " in said for name in FAMILIES)
+    assert all(f"{name}/<name>: " in said for name in SUITES)
     for line in ("  traffic-junction-medium", f"  {SPREAD}", "mpe/<name>: installed", "smac/<name>: not installed"):
         assert f"{line}\n" in said
-    assert f"  {FAMILIES['smac'].install}\n  Not 'pip install smac', which installs another project" in said
+    assert f"  {SUITES['smac'].install}\n  Not 'pip install smac', which installs another project" in said
     assert "  ... and " in said and "sb3-belief envs list pettingzoo" in said
     assert main(["envs", "list", "pettingzoo"]) == 0
     said = capsys.readouterr().out

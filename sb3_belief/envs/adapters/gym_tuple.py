@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 
 from sb3_belief.envs.base import TeamGame
-from sb3_belief.envs.families import nearest
+from sb3_belief.envs.suites import nearest
 
 _SEQUENCES = (list, tuple, np.ndarray)
 Step = tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]

@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
 from sb3_belief.envs.adapters.pettingzoo import Adapter, versioned_modules
-from sb3_belief.envs.families import unknown_name
+from sb3_belief.envs.suites import unknown_name
 
 
 def names() -> list[str]:

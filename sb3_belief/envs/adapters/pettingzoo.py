@@ -12,7 +12,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
-from sb3_belief.envs.families import unknown_name
+from sb3_belief.envs.suites import unknown_name
 
 _GROUPS = ("atari", "butterfly", "classic", "sisl")
 

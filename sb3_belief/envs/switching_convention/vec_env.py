@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
 from sb3_belief.envs.switching_convention.parallel_env import FOLLOWER, LEADER
-from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 
 class SwitchingConventionVecEnv(TeamVecEnv):

@@ -17,7 +17,7 @@ from sb3_belief.envs.traffic_junction.parallel_env import (
     agent_names,
 )
 from sb3_belief.envs.traffic_junction.rendering import Renderer
-from sb3_belief.team.vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 
 class TrafficJunctionVecEnv(TeamVecEnv):

@@ -1,0 +1,1 @@
+"""What all other packages build on: random number generators, processes, exceptions, versions."""

@@ -1,0 +1,130 @@
+"""Many battles of SMAX stepped at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_belief.envs.adapters.smax.core import Battles
+from sb3_belief.envs.adapters.smax.parallel_env import RENDER_MODES, observation_space
+from sb3_belief.envs.adapters.smax.program import BattleConfig
+from sb3_belief.envs.adapters.smax.rendering import draw
+from sb3_belief.envs.base import check_render_mode
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+
+
+class SmaxVecEnv(TeamVecEnv):
+    """
+    ``num_envs`` copies of :class:`~sb3_belief.envs.adapters.smax.parallel_env.Smax` in one compiled step. Each copy has a
+    random generator of its own: copy i seeded with s + i (as ``seed(s)`` does) lives the life of one ``Smax`` that was reset
+    with the seed s + i and then without one.
+
+    :param num_envs: number of copies, at least 1
+    :param map_name: one of the maps
+    :param observe_last_actions: leave the last actions of allies in view in the observations
+    :param render_mode: None or ``"rgb_array"``
+    :param options: what to change of SMAX
+    :raises ValueError: for a value that is not allowed
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        map_name: str,
+        observe_last_actions: bool = False,
+        render_mode: str | None = None,
+        **options: Any,
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} must be at least 1.")
+        self.battles = Battles(num_envs, BattleConfig.of(map_name, observe_last_actions, options))
+        agents = self.battles.agents
+        super().__init__(
+            num_envs,
+            agents,
+            {agent: observation_space(self.battles) for agent in agents},
+            {agent: spaces.Discrete(self.battles.n_actions) for agent in agents},
+            render_mode=check_render_mode(render_mode, RENDER_MODES),
+        )
+        self._no_flags, self._all_flags = np.zeros(len(agents), dtype=bool), np.ones(len(agents), dtype=bool)
+        for shared in (self._no_flags, self._all_flags):
+            shared.flags.writeable = False
+
+    def _reset_joint(self) -> TeamObs:
+        for copy, seed in enumerate(self._seeds):
+            if seed is not None:
+                self.battles.seed(copy, seed)
+        self.battles.reset()
+        return self._observe()
+
+    def _step_joint(self, actions: TeamObs) -> TeamStep:
+        joint = np.stack([actions[agent] for agent in self.possible_agents], axis=1)
+        if joint.dtype.kind not in "iu" or joint.min() < 0 or joint.max() >= self.battles.n_actions:
+            raise ValueError(self._wrong_action(joint))
+        result = self.battles.step(joint)
+        team_rewards = result.rewards
+        rewards = np.repeat(team_rewards[:, None], len(self.possible_agents), axis=1)
+        infos: list[dict[str, Any]] = [
+            {
+                "agent_rewards": reward,
+                "visible": visible,
+                "active": active,
+                # The reward is the team's: a death ends no return, the battle's end ends all
+                "life_end": self._all_flags if ended and not cut else self._no_flags,
+                "truncated": self._all_flags if cut else self._no_flags,
+            }
+            for reward, visible, active, ended, cut in zip(
+                rewards, result.visible, result.active, result.ended.tolist(), result.cut.tolist(), strict=True
+            )
+        ]
+        obs = self._observe()
+        ended = np.flatnonzero(result.ended)
+        if len(ended):
+            for copy in ended:
+                infos[copy]["is_success"] = bool(result.won[copy])
+                infos[copy]["TimeLimit.truncated"] = bool(result.cut[copy])
+                infos[copy]["terminal_observation"] = {agent: values[copy] for agent, values in obs.items()}
+            self.battles.reset(ended)
+            obs = self._observe()
+        return obs, team_rewards, result.ended, infos
+
+    def _observe(self) -> TeamObs:
+        return dict(zip(self.possible_agents, self.battles.observations, strict=True))
+
+    def _wrong_action(self, joint: np.ndarray) -> str:
+        allowed = f"allowed are the integers from 0 to {self.battles.n_actions - 1}"
+        if joint.dtype.kind not in "iu":
+            return f"The actions are of type {joint.dtype}; {allowed}."
+        copy, i = np.argwhere((joint < 0) | (joint >= self.battles.n_actions))[0]
+        return f"The action of {self.possible_agents[i]!r} in copy {copy} is {joint[copy, i]}; {allowed}."
+
+    def action_masks(self) -> dict[str, np.ndarray]:
+        """
+        :return: {agent: bool [num_envs, k]}: the dead may only stop
+        """
+        return dict(zip(self.possible_agents, self.battles.masks, strict=True))
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """
+        :return: for each copy all that decides how it goes on
+        """
+        return self.battles.get_states()
+
+    def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
+        """
+        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+
+        :param states: what ``get_state`` returned with as many copies of the same map
+        :return: the current observations, {agent: array [num_envs, width]}
+        :raises ValueError: if the number of copies or the map differs
+        """
+        self.battles.set_states(states)
+        self._zero_episode_sums()
+        return self._observe()
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """
+        :return: a picture of each copy, uint8 [height, width, 3]
+        """
+        return [draw(self.battles, copy) for copy in range(self.num_envs)]

@@ -1,0 +1,190 @@
+"""Fixed partners of one learner: whatever can choose actions for an agent of a team."""
+
+import inspect
+import io
+import os
+import pathlib
+import zipfile
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+from gymnasium import spaces
+from numpy.random import mtrand
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.team.checkpoint import read_team
+from sb3_belief.team.predictor import PolicyState, Predictor
+
+# Path of a zip, an SB3 model or another object with its ``predict``, or a callable ``obs -> action``
+PartnerLike: TypeAlias = Any
+
+# A zip of SB3 names its policy but not its algorithm. Of algorithms that share their policies one is enough: they differ in
+# how they learn, not in how they act (PPO also reads A2C's and TRPO's, TD3 also DDPG's)
+_READERS: tuple[type[BaseAlgorithm], ...] = (
+    BeliefPPO,
+    MaskableBeliefPPO,
+    stable_baselines3.PPO,
+    stable_baselines3.SAC,
+    stable_baselines3.TD3,
+    stable_baselines3.DQN,
+    sb3_contrib.MaskablePPO,
+    sb3_contrib.RecurrentPPO,
+    sb3_contrib.QRDQN,
+    sb3_contrib.TQC,
+    sb3_contrib.CrossQ,
+)
+
+
+class CallersRng(RngState):
+    """
+    What the caller draws from, kept by ``suspend`` while partners draw from their own streams. As light as can be, since it is
+    for every step, where ``RngSwitch`` would take longer than the rest.
+    """
+
+    def suspend(self) -> None:
+        """Note what the caller's generators are and how far they have come."""
+        self._numpy = mtrand.get_bit_generator()  # type: ignore[assignment]
+        super().suspend()
+
+
+class Partner:
+    """
+    Acts for one agent, with random numbers and a recurrent state of its own.
+
+    :param name: of the agent
+    :param given: what acts, see ``AgentEnv``
+    :param observation_space: of the agent
+    :param action_space: of the agent
+    :param deterministic: SB3 models take their most likely actions instead of samples
+    :param seed: of its random numbers, None: from the operating system's entropy
+    :raises TypeError: if it cannot act
+    :raises ValueError: if it has been made for other spaces, or if a zip cannot be read as a model
+    """
+
+    def __init__(
+        self,
+        name: str,
+        given: PartnerLike,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        deterministic: bool,
+        seed: int | None = None,
+    ):
+        self.stream = RngState(seed)
+        self._name, self._deterministic = name, deterministic
+        self._state: PolicyState = None
+        self._new = True
+        statistics: VecNormalize | None = None
+        if isinstance(given, (str, os.PathLike)):
+            # Building a network draws random numbers, which the learner must not miss
+            with RngSwitch(self.stream):
+                given, statistics = load_model(given, name)
+        elif isinstance(given, BaseAlgorithm):
+            statistics = given.get_vec_normalize_env()
+        self._actor: Predictor | None = None
+        if isinstance(given, type) or not (callable(given) or hasattr(given, "predict")):
+            raise TypeError(
+                f"The partner {name!r} is {given!r}; it must be an SB3 model, the path of the zip of one, an object with SB3's"
+                " predict(obs, state, episode_start, deterministic), or a callable obs -> action."
+            )
+        if hasattr(given, "predict"):
+            _check_spaces(name, given, observation_space, action_space)
+            self._actor = Predictor(given, statistics)
+        else:
+            self._function = given
+            self._takes_masks = _takes_masks(given)
+
+    def act(self, obs: Any, episode_start: bool, mask: np.ndarray | None) -> np.ndarray:
+        """
+        :param obs: one observation of the agent
+        :param episode_start: whether its return has ended at the last step
+        :param mask: bool [k], its possible actions; None if the environment has no masks for it
+        :return: its action
+        :raises TypeError: if ``predict`` returns something else than an action and a state
+        """
+        if self._actor is None:
+            kwargs = {"action_masks": mask} if self._takes_masks else {}
+            return np.asarray(self._function(obs, **kwargs))
+        start, self._new = np.array([episode_start or self._new]), False
+        result = self._actor.predict(obs, self._state, start, self._deterministic, mask)
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise TypeError(
+                f"predict() of the partner {self._name!r} returned {result!r}; as SB3's it must return (action, state)."
+            )
+        action, self._state = result
+        return np.asarray(action)
+
+    def start_anew(self, seed: int | None = None) -> None:
+        """
+        :param seed: of its random numbers from now on, None: they go on
+        """
+        self._state, self._new = None, True
+        if seed is not None:
+            self.stream = RngState(seed)
+
+
+def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecNormalize | None]:
+    """
+    :param path: of an SB3 zip, with or without ".zip"; of a saved team; or ``"team.zip:<agent>"``
+    :param agent: whose model is taken from a team's file that names none
+    :return: the model, and its normalisation if the team's file has one
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it is damaged, lacks the agent, or is of an algorithm that is not known here
+    """
+    text = os.fspath(path)
+    head, colon, member = text.rpartition(":")
+    file, agent = (head, member) if colon and head.endswith(".zip") else (text, agent)
+    if not pathlib.Path(file).exists() and pathlib.Path(f"{file}.zip").exists():
+        file = f"{file}.zip"
+    if not pathlib.Path(file).is_file():
+        raise FileNotFoundError(f"There is no {file!r} to load a partner from.")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            is_team = "team.json" in archive.namelist()
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{file!r} is not the zip of a model or of a team, or it is damaged: {error}.") from error
+    if is_team:
+        saved = read_team(file)
+        if agent not in saved.models:
+            raise ValueError(
+                f"{file!r} is a team of {list(saved.models)}, without {agent!r}: name one of them, e.g."
+                f" '{file}:{next(iter(saved.models))}'."
+            )
+        model = saved.algo_class(agent).load(io.BytesIO(saved.models[agent]), device="cpu")
+        return model, saved.statistics.get(agent)
+    data, _, _ = load_from_zip_file(file, device="cpu")
+    policy_class = (data or {}).get("policy_class")
+    for base in getattr(policy_class, "__mro__", ()):
+        for reader in _READERS:
+            if base in reader.policy_aliases.values():
+                return reader.load(file, device="cpu"), None
+    known = ", ".join(reader.__name__ for reader in _READERS)
+    raise ValueError(
+        f"{file!r} holds a model with the policy {policy_class}, from which its algorithm cannot be told: pass the model"
+        f" itself, loaded with its own class, instead of its path. Paths are for {known} and what shares their policies."
+    )
+
+
+def _check_spaces(name: str, model: Any, observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    for kind, wanted in (("observation", observation_space), ("action", action_space)):
+        found = getattr(model, f"{kind}_space", wanted)
+        if found != wanted:
+            raise ValueError(
+                f"The partner {name!r} has been made for the {kind} space {found}, but {name!r} has {wanted} in this"
+                " environment."
+            )
+
+
+def _takes_masks(function: Callable[..., Any]) -> bool:
+    try:
+        return "action_masks" in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        # What is written in C need not tell its arguments
+        return False

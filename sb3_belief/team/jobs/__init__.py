@@ -1,5 +1,0 @@
-"""Several processes share a team's agents: they update them and choose their actions."""
-
-from sb3_belief.team.jobs.sharing import Jobs, check_jobs
-
-__all__ = ["Jobs", "check_jobs"]

@@ -1,0 +1,1 @@
+"""Several unmodified SB3 models learn in one joint environment, step by step together."""

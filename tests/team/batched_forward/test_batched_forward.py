@@ -1,0 +1,222 @@
+"""Agents with equal networks act together, and learn, draw and log the same as when each acts alone, bit for bit."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.belief_ppo import BeliefActorCriticPolicy
+from sb3_belief.team.batched_forward import networks, passes
+from sb3_belief.team.batched_forward.passes import ForwardRequest
+from tests.team.helpers import Team, make_team_env
+from tests.team.parallel.test_jobs import Draws, OwnNetwork, Pushes, everything
+from tests.team.toy_envs import ToyEnv
+
+EASY = "traffic-junction-easy"
+PPO_KWARGS: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "n_epochs": 2}
+
+
+@pytest.fixture
+def sizes(monkeypatch):
+    """
+    :return: of how many agents the passes were that have been made together
+    """
+    found: list[int] = []
+    call = networks.StackedNetworks.__call__
+
+    def count(self, flat, noise):
+        found.append(len(flat))
+        return call(self, flat, noise)
+
+    monkeypatch.setattr(networks.StackedNetworks, "__call__", count)
+    # Without those that only try out whether they agree
+    monkeypatch.setattr(passes, "_agrees", Agrees())
+    return found
+
+
+class Agrees(dict):
+    def __contains__(self, key):
+        return True
+
+    def __missing__(self, key):
+        return True
+
+
+def learn_both_ways(monkeypatch, sizes, n_rollouts=3, callback=None, **kwargs):
+    """
+    :return: of how many agents the passes were that have been made together, when agents act as they do
+    """
+    results = []
+    for alone in (True, False):
+        with monkeypatch.context() as patch:
+            if alone:
+                patch.setattr(passes, "signature", lambda policy: None)
+            sizes.clear()
+            team = toy_team(**kwargs)
+            n_steps = next(iter(team.agents.values())).n_steps
+            team.learn(8 * n_steps * n_rollouts, callback() if callback else None)
+            results.append(everything(team, {}))
+            assert not alone or not sizes
+    assert results[0] == results[1]
+    return list(sizes)
+
+
+def toy_team(algo=PPO, env_id=lambda: ToyEnv(3), policy="MlpPolicy", **kwargs):
+    if algo is PPO:
+        kwargs = {**PPO_KWARGS, **kwargs}
+    return Team(algo, policy, make_team_env(env_id, n_envs=8), seed=0, device="cpu", **kwargs)
+
+
+BELIEF = {"policy": "BeliefPolicy", "env_id": EASY, "n_steps": 20, "batch_size": 40, "n_epochs": 1, "history_length": 100}
+SAME: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "a2c": {"algo": A2C, "n_steps": 8},
+    "leaky": {"policy_kwargs": {"activation_fn": th.nn.LeakyReLU, "net_arch": [32, 64]}},
+    "noise of a rollout": {"use_sde": True, "env_id": lambda: Pushes(3)},
+    "fused optimiser": {"policy_kwargs": {"optimizer_kwargs": {"fused": True}}},
+    "normalised": {"normalize": True},
+    "maskable": {"algo": MaskablePPO, "env_id": EASY, **PPO_KWARGS},
+    "belief": {"algo": BeliefPPO, **BELIEF},
+    "masks and belief": {"algo": MaskableBeliefPPO, **BELIEF},
+    "no belief": {"algo": BeliefPPO, **BELIEF, "belief": "none"},
+    "static": {"algo": BeliefPPO, **BELIEF, "belief": "static", "policy_latent": "mean"},
+    "context": {"algo": BeliefPPO, **BELIEF, "belief": "context", "detach_belief": True, "similarity": "observation"},
+    "wide": {"algo": BeliefPPO, **BELIEF, "belief": "wide"},
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_the_same_is_learned(case, monkeypatch, sizes):
+    found = learn_both_ways(monkeypatch, sizes, **SAME[case])
+    n_agents, n_steps = 5 if SAME[case].get("env_id") == EASY else 3, SAME[case].get("n_steps", 8)
+    if SAME[case].get("belief", "dynamic") in ("dynamic", "context") and "history_length" in SAME[case]:
+        # While histories grow, agents may remember different numbers of steps
+        assert found[:n_steps] == [n_agents] * n_steps and sum(found[n_steps:]) > 2 * n_agents * n_steps / 2
+    else:
+        assert found == [n_agents] * n_steps * 3
+
+
+def test_the_policies_that_act_together_are_the_ones_that_agree(monkeypatch, sizes):
+    monkeypatch.setattr(passes, "_agrees", {})
+    found = learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]})
+    # Tried out once
+    assert found == [3] * 25
+    # So small that their products are rounded in another way together than alone
+    assert learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [3, 1]}) == [3]
+
+
+class Hooked(BaseCallback):
+    """A team's callback that adds a hook to an agent's network, within a rollout."""
+
+    model: Any
+
+    def _on_step(self):
+        if self.n_calls == 12:
+            self.model.agents["agent_1"].policy.mlp_extractor.register_forward_hook(lambda *_: None)
+        return True
+
+
+class Writes(BaseCallback):
+    """A team's callback that changes agents within rollouts, in all ways there are."""
+
+    model: Any
+
+    @th.no_grad()
+    def _on_step(self):
+        policies = [self.model.agents[f"agent_{i}"].policy for i in range(3)]
+        layer = next(module for module in policies[0].mlp_extractor.modules() if isinstance(module, th.nn.Linear))
+        if self.n_calls == 3:
+            layer.weight.mul_(1.5)
+        elif self.n_calls == 6:
+            layer.bias = th.nn.Parameter(layer.bias + 0.5)
+        elif self.n_calls == 11:
+            layer.weight.data = layer.weight + 0.5
+        elif self.n_calls == 13:
+            policies[1].load_state_dict(policies[2].state_dict())
+        elif self.n_calls == 15:
+            policies[2].load_from_vector(policies[2].parameters_to_vector() * 1.1)
+        return True
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"algo": BeliefPPO, "policy": "BeliefPolicy", "history_length": 20, **PPO_KWARGS}])
+def test_weights_that_are_changed_within_a_rollout_count_at_once(kwargs, monkeypatch, sizes):
+    assert learn_both_ways(monkeypatch, sizes, callback=Writes, **kwargs) == [3] * 24
+
+
+class MyPolicy(ActorCriticPolicy):
+    """One of one's own."""
+
+
+OWN: dict[str, dict[str, Any]] = {
+    "own policy": {"policy": MyPolicy},
+    "own extractor": {"policy_kwargs": {"features_extractor_class": OwnNetwork}},
+    "two extractors": {"policy_kwargs": {"share_features_extractor": False}},
+    "another activation": {"policy_kwargs": {"activation_fn": th.nn.SiLU}},
+    "recurrent": {"algo": RecurrentPPO, "policy": "MlpLstmPolicy", **PPO_KWARGS},
+}
+
+
+@pytest.mark.parametrize("case", OWN)
+def test_who_acts_alone(case, monkeypatch, sizes):
+    assert learn_both_ways(monkeypatch, sizes, **OWN[case]) == []
+
+
+def test_those_of_one_kind_act_together(monkeypatch, sizes):
+    shape = {"agent_2": {"policy_kwargs": {"net_arch": [64]}}}
+    assert learn_both_ways(monkeypatch, sizes, agent_kwargs=shape) == [2] * 24
+    two = {f"agent_{i}": {"policy_kwargs": {"net_arch": [64]}} for i in (1, 3)}
+    assert learn_both_ways(monkeypatch, sizes, env_id=lambda: ToyEnv(4), agent_kwargs=two) == [2] * 48
+    # From the rollout after that in which it gets the hook
+    assert learn_both_ways(monkeypatch, sizes, callback=Hooked) == [3] * 16 + [2] * 8
+
+
+def test_who_has_a_callback_acts_alone(sizes):
+    team = toy_team()
+    team.learn(8 * 8, agent_callbacks={"agent_1": Draws()})
+    assert sizes == [2] * 8
+    sizes.clear()
+    team.learn(8 * 8, agent_callbacks={"agent_1": Draws(), "agent_2": Draws()})
+    assert sizes == []
+    assert all({"forward", "mlp_extractor", "extract_features"}.isdisjoint(vars(m.policy)) for m in team.agents.values())
+
+
+def test_what_a_user_has_replaced_stays(sizes):
+    team = toy_team(env_id=lambda: ToyEnv(4))
+    models = [team.agents[f"agent_{i}"] for i in range(4)]
+    asked, trained = [], []
+
+    def forward(obs):
+        asked.append(len(obs))
+        return type(models[0].policy).forward(models[0].policy, obs)
+
+    def train():
+        trained.append(True)
+        PPO.train(models[1])
+
+    models[0].policy.forward, models[1].train = forward, train
+    team.learn(8 * 16)
+    assert (models[0].policy.forward, models[1].train) == (forward, train)
+    assert len(asked) == 16 and len(trained) == 2 and sizes == [3] * 16
+
+
+def make_policies(n):
+    others = {"other": spaces.Discrete(3)}
+    space = spaces.Box(-10, 10, (6,)), spaces.Discrete(5)
+    policies = [BeliefActorCriticPolicy(*space, lambda _: 1e-3, others_action_spaces=others) for _ in range(n)]
+    for policy in policies:
+        policy.remember(th.randn(60, 6).numpy(), np.eye(3, dtype=np.float32)[np.arange(60) % 3])
+    return policies
+
+
+def test_a_policy_unlike_any_of_sb3_acts_by_itself():
+    with th.no_grad():
+        assert not ForwardRequest(th.nn.Linear(2, 2)).can_take(th.zeros(1, 2))
+        assert ForwardRequest(make_policies(1)[0]).can_take(th.zeros(1, 6))
+    assert not ForwardRequest(make_policies(1)[0]).can_take(th.zeros(1, 6))

@@ -1,0 +1,497 @@
+"""One learner among fixed partners: it must meet what it meets in a Team."""
+
+import zipfile
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from mpe2 import simple_spread_v3
+from sb3_contrib import TRPO
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+import sb3_belief
+from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.envs import TrafficJunction
+from sb3_belief.team.lockstep.joint_loop import JointLoop
+from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
+from tests.team.toy_envs import BlinkingEnv, MaskedEnv, MixedEnv, PartneredEnv, ScriptedEnv, ToyEnv
+
+AgentEnv: Any = sb3_belief.AgentEnv
+BELIEF: dict[str, Any] = {
+    **PPO_KWARGS,
+    "history_length": 16,
+    "policy_kwargs": {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4},
+}
+
+
+def zero(obs):
+    return 0
+
+
+def one(obs):
+    return 1
+
+
+class Playback:
+    """
+    A partner that does what it is told beforehand.
+
+    :param actions: one a step
+    """
+
+    def __init__(self, actions):
+        self.actions = iter(actions)
+
+    def __call__(self, obs):
+        return next(self.actions)
+
+
+class Counting:
+    """Has SB3's ``predict`` and a state, which it notes with the episode starts; it does the number of the step modulo 3."""
+
+    def __init__(self):
+        self.calls: list[tuple] = []
+
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
+        t = 0 if state is None or episode_start[0] else state[0] + 1
+        self.calls.append((t, bool(episode_start[0]), deterministic))
+        return t % 3, (t,)
+
+
+def spread():
+    return simple_spread_v3.parallel_env(N=3, max_cycles=7)
+
+
+def toy(n_agents=3):
+    return partial(ToyEnv, n_agents=n_agents)
+
+
+def sampled(env, n_steps, seed=5):
+    """
+    :return: {agent: actions of one copy of a team's environment, one a step}
+    """
+    rng = np.random.default_rng(seed)
+    actions: dict[str, list] = {}
+    for agent in env.possible_agents:
+        space = env.action_space[agent]
+        space.seed(int(rng.integers(2**31)))
+        actions[agent] = [np.asarray(space.sample()) for _ in range(n_steps)]
+    return actions
+
+
+def team_steps(make, agent, actions, n_steps):
+    """
+    :return: what the agent is given in a team: its first observation, and its parts of the steps
+    """
+    env = make_team_env(make, n_envs=1, seed=11)
+    scheduler = JointLoop(env)
+    first = env.reset()[agent]
+    parts = []
+    for t in range(n_steps):
+        joint = {name: column[t][None] for name, column in actions.items()}
+        parts.append(scheduler._views.split(joint, env.step(joint))[env.possible_agents.index(agent)])
+    env.close()
+    return first, parts
+
+
+ENVS: dict[str, tuple[Any, list[str]]] = {
+    "toy": (toy(), ["agent_0", "agent_2"]),
+    "mixed": (MixedEnv, ["zeta", "multi", "binary"]),
+    "blinking": (BlinkingEnv, ["arrow"]),
+    "life_end": (ScriptedEnv, ["stays", "last"]),
+    "traffic": (partial(TrafficJunction, "easy", arrival_rate=0.3), ["car_0", "car_3"]),
+    "spread": (spread, ["agent_0", "agent_1"]),
+}
+CASES = [pytest.param(make, agent, id=f"{name}-{agent}") for name, (make, agents) in ENVS.items() for agent in agents]
+
+
+@pytest.mark.parametrize("make, agent", CASES)
+def test_the_learner_meets_what_it_meets_in_a_team(make, agent):
+    n_steps = 90
+    template = make_team_env(make, n_envs=1)
+    actions = sampled(template, n_steps)
+    first, parts = team_steps(make, agent, actions, n_steps)
+
+    partners = {name: Playback(column) for name, column in actions.items() if name != agent}
+    env: Any = DummyVecEnv([lambda: AgentEnv(make, agent, partners)])
+    others = template.get_attr("action_spaces")[0] | template.scripted_action_spaces
+    assert list(env.get_attr("others_action_spaces")[0].items()) == [(k, v) for k, v in others.items() if k != agent]
+    env.seed(11)
+    assert np.array_equal(env.reset(), first)
+    n_dones = n_cut = 0
+    for action, (obs, rewards, dones, infos) in zip(actions[agent], parts, strict=True):
+        found_obs, found_rewards, found_dones, found_infos = env.step(action[None])
+        assert found_obs.dtype == obs.dtype and np.array_equal(found_obs, obs)
+        assert found_rewards.dtype == rewards.dtype and np.array_equal(found_rewards, rewards)
+        assert np.array_equal(found_dones, dones)
+        info, found = dict(infos[0]), found_infos[0]
+        # a Monitor writes it, which counts what the learner has had since a reset
+        info.pop("episode", None)
+        # SB3's vectorisers say so at every step
+        info.setdefault("TimeLimit.truncated", False)
+        assert found.keys() == info.keys()
+        for key, value in info.items():
+            assert np.array_equal(found[key], value), key
+        for key in ("others_actions", "others_visible"):
+            assert found[key].dtype == info[key].dtype and found[key].shape == info[key].shape
+        n_dones, n_cut = n_dones + int(dones[0]), n_cut + int(info["TimeLimit.truncated"])
+    # MixedEnv terminates, all others end by their limits
+    assert n_dones >= 4 and (n_cut > 0) == (make is not MixedEnv)
+    env.close()
+
+
+@pytest.mark.parametrize("agent, last, cut", [("dies", 5, False), ("cut", 6, True)])
+def test_a_learner_that_has_left_does_not_wait_for_the_others(agent, last, cut):
+    """Steps and ends are as in a Team up to where it leaves; of the rest of the episode it hears only how it ended."""
+    n_steps = 3 * 8
+    template = make_team_env(ScriptedEnv, n_envs=1)
+    actions = sampled(template, n_steps)
+    _, parts = team_steps(ScriptedEnv, agent, actions, n_steps)
+    partners = {name: Playback(column) for name, column in actions.items() if name != agent}
+    env = AgentEnv(ScriptedEnv, agent, partners)
+    for episode in range(3):
+        obs, _ = env.reset(seed=11 if episode == 0 else None)
+        assert obs.tolist() == [0, 10 * (episode + 1)]
+        for t in range(last):
+            k = 8 * episode + t
+            obs, reward, terminated, truncated, info = env.step(actions[agent][k])
+            _, rewards, dones, infos = parts[k]
+            assert reward == rewards[0] and (terminated or truncated) == dones[0] and truncated == (cut and t == last - 1)
+            assert np.array_equal(info["others_actions"], infos[0]["others_actions"]) and info["active"]
+        assert (terminated or truncated) and obs.tolist() == [last, 10 * (episode + 1)]
+        assert info["is_success"] == (episode % 2 == 1)
+
+
+def test_a_dead_partner_is_neither_seen_nor_told():
+    env = AgentEnv(ScriptedEnv, "last", {"stays": one, "dies": one, "cut": one})
+    env.reset(seed=0)
+    seen = []
+    for t in range(1, 9):
+        _, _, terminated, truncated, info = env.step(0)
+        seen.append(info["others_visible"].tolist())
+        assert info["others_actions"].tolist() == [x for s in seen[-1] for x in ([0.0, 1.0] if s else [0.0, 0.0])]
+        assert not terminated and truncated == (t == 8)
+    stays, dies, cut = zip(*seen, strict=True)
+    assert stays == (True, True, True, False, False, True, True, True)
+    assert dies == (True,) * 5 + (False,) * 3 and cut == (True,) * 6 + (False,) * 2
+
+
+def test_after_its_own_end_reset_goes_on_unless_it_is_told_otherwise():
+    env = AgentEnv(ScriptedEnv, "stays", {"dies": one, "cut": one, "last": one})
+    env.reset(seed=0)
+    for _ in range(3):
+        _, _, terminated, _, _ = env.step(0)
+    assert terminated
+    assert env.reset()[0].tolist() == [3, 10]
+    assert env.step(0)[0].tolist() == [4, 10]
+    # in the midst of an episode, and with a seed or options, a reset is one
+    assert env.reset()[0].tolist() == [0, 20]
+    for _ in range(3):
+        env.step(0)
+    assert env.reset(seed=1)[0].tolist() == [0, 30]
+    for _ in range(3):
+        env.step(0)
+    assert env.reset(options={"a": 1})[0].tolist() == [0, 40]
+
+
+@pytest.mark.filterwarnings("error")  # such as the one on the matrix that "binary" observes
+@pytest.mark.parametrize("make, agent", [case.values for case in CASES if case.id != "mixed-binary"] + [(ScriptedEnv, "dies")])
+def test_sb3_finds_nothing_wrong_with_it(make, agent):
+    spaces = make_team_env(make, n_envs=1).action_space
+    partners = {name: partial(_sample, space) for name, space in spaces.items() if name != agent}
+    check_env(AgentEnv(make, agent, partners))
+
+
+def _sample(space, obs):
+    return space.sample()
+
+
+def test_order_of_calls():
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": zero})
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+        env.step(0)
+    env.reset()
+    for _ in range(7):
+        env.step(0)
+    with pytest.raises(RuntimeError, match="'agent_0' is over"):
+        env.step(0)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "agent, partners, kwargs, error, message",
+    [
+        ("agent_0", {"agent_1": zero}, {}, ValueError, r"\['agent_2'\] of this environment have no partner"),
+        ("agent_0", {}, {}, ValueError, r"\['agent_1', 'agent_2'\] .* no partner .* each of \['agent_1', 'agent_2'\]"),
+        ("agent_9", {}, {}, ValueError, r"no agent 'agent_9' to learn; the environment has \['agent_0', "),
+        ("agent_0", {"agent_0": zero, "agent_1": zero, "agent_2": zero}, {}, ValueError, "'agent_0' is the learner"),
+        ("agent_0", {"agent_1": zero, "agent_2": zero, "bob": zero}, {}, ValueError, "'bob' is not an agent"),
+        ("agent_0", {"agent_1": zero, "agent_2": 3}, {}, TypeError, "The partner 'agent_2' is 3; it must be"),
+        ("agent_0", {"agent_1": zero, "agent_2": PPO}, {}, TypeError, "it must be an SB3 model"),
+        ("agent_0", [zero, zero], {}, TypeError, r"a dict \{agent: partner\}"),
+        ("agent_0", {"agent_1": zero, "agent_2": "nowhere.zip"}, {}, FileNotFoundError, "no 'nowhere.zip'"),
+        ("agent_0", {"agent_1": zero, "agent_2": zero}, {"visibility": 3}, TypeError, "callable"),
+    ],
+)
+def test_wrong_input(agent, partners, kwargs, error, message):
+    with pytest.raises(error, match=message):
+        env = AgentEnv(toy(), agent, partners, **kwargs)
+        env.reset()
+        env.step(0)
+
+
+def test_wrong_environments():
+    with pytest.raises(ValueError, match=r"'limit'.*made already"):
+        AgentEnv(ToyEnv(), "agent_0", {"agent_1": zero}, env_kwargs={"limit": 3})
+    with pytest.raises(TypeError, match=r"needs a pettingzoo.ParallelEnv, got int"):
+        AgentEnv(3, "agent_0", {})
+    with pytest.raises(ValueError, match="Unknown environment id"):
+        AgentEnv("nothing-like-it", "agent_0", {})
+
+
+def test_wrong_partners_in_play():
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": lambda obs: 7})
+    env.reset()
+    with pytest.raises(ValueError, match=r"The action of 'agent_1' .* is 7"):
+        env.step(0)
+
+    class Odd:
+        def predict(self, obs, state=None, episode_start=None, deterministic=False):
+            return 1
+
+    env.set_partner("agent_1", Odd())
+    with pytest.raises(TypeError, match=r"predict\(\) of the partner 'agent_1' returned 1"):
+        env.step(0)
+
+
+def test_ids_instances_and_lone_learners():
+    partners = {f"car_{i}": zero for i in (0, 2, 3, 4)}
+    env = AgentEnv("traffic-junction-easy", "car_1", partners, env_kwargs={"arrival_rate": 0.5}, render_mode="rgb_array")
+    assert env.parallel_env.unwrapped.render_mode == "rgb_array"
+    env.reset(seed=0)
+    assert env.render().ndim == 3
+    assert list(env.others_action_spaces) == ["car_0", "car_2", "car_3", "car_4"]
+    made = ToyEnv(2)
+    assert AgentEnv(made, "agent_1", {"agent_0": zero}).parallel_env is made
+    lone = AgentEnv(toy(1), "agent_0", {})
+    lone.reset(seed=0)
+    assert lone.step(1)[4]["others_actions"].shape == (0,)
+
+
+def test_visibility_given_by_the_user():
+    def nobody(env):
+        return {agent: np.zeros(1, bool) for agent in env.possible_agents}
+
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": one}, visibility=nobody)
+    env.reset(seed=0)
+    info = env.step(0)[4]
+    assert not info["others_visible"].any() and not info["others_actions"].any()
+
+
+# Partners
+
+
+def trained(path=None, algo=PPO, env=None, **kwargs):
+    """
+    :return: a team of two on the toy, a little trained
+    """
+    env = make_team_env(toy(2), n_envs=2) if env is None else env
+    team = Team(algo, "BeliefPolicy" if algo is BeliefPPO else "MlpPolicy", env, seed=3, **{**PPO_KWARGS, **kwargs})
+    team.learn(64)
+    if path is not None:
+        team.save(path)
+    return team
+
+
+def others_did(env, n_steps=20, seed=0):
+    """
+    :return: what the learner saw the others do
+    """
+    env.reset(seed=seed)
+    seen = []
+    for _ in range(n_steps):
+        _, _, terminated, truncated, info = env.step(1)
+        seen.append(info["others_actions"])
+        if terminated or truncated:
+            env.reset()
+    return np.stack(seen)
+
+
+def test_all_forms_of_a_model_act_alike(tmp_path):
+    team = trained(tmp_path / "team.zip", normalize=True)
+    model = team.agents["agent_1"]
+    forms = [model, tmp_path / "team.zip", str(tmp_path / "team"), f"{tmp_path / 'team.zip'}:agent_1"]
+    expected, *found = [others_did(AgentEnv(toy(2), "agent_0", {"agent_1": form})) for form in forms]
+    for did in [*found, others_did(AgentEnv(toy(2), "agent_0", tmp_path / "team.zip"))]:
+        assert np.array_equal(did, expected)
+    assert len(np.unique(expected, axis=0)) > 1
+    # and as the Team predicts, normalisation included
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": model}, deterministic=True)
+    did = others_did(env, 6)
+    reference = ToyEnv(2)
+    obs, _ = reference.reset(seed=0)
+    for step in did:
+        action = team.predict(obs, deterministic=True)[0]["agent_1"]
+        assert step.argmax() == action
+        obs = reference.step({"agent_0": 1, "agent_1": action})[0]
+    with pytest.raises(ValueError, match=r"a team of \['agent_0', 'agent_1'\], without 'bob'"):
+        AgentEnv(toy(2), "agent_0", {"agent_1": f"{tmp_path / 'team.zip'}:bob"})
+
+
+@pytest.mark.parametrize("algo", [PPO, A2C, TRPO, DQN, BeliefPPO])
+def test_zips_of_single_models(tmp_path, algo):
+    kwargs: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
+    env = make_team_env(toy(2), n_envs=1)
+    team = Team(algo, "BeliefPolicy" if algo is BeliefPPO else "MlpPolicy", env, seed=1, **kwargs)
+    model = team.agents["agent_1"]
+    model.save(tmp_path / "model.zip")
+    expected = others_did(AgentEnv(toy(2), "agent_0", {"agent_1": model}, deterministic=True))
+    for path in ("model.zip", "model"):
+        env = AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / path}, deterministic=True)
+        assert np.array_equal(others_did(env), expected)
+
+
+def test_files_that_hold_no_partner(tmp_path):
+    (tmp_path / "text.zip").write_text("nothing")
+    with pytest.raises(ValueError, match="is not the zip of a model or of a team"):
+        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "text.zip"})
+    model = PPO("MlpPolicy", gym.make("CartPole-v1"), **PPO_KWARGS)
+    model.save(tmp_path / "cartpole.zip")
+    with pytest.raises(ValueError, match=r"'agent_1' has been made for the observation space .* but 'agent_1' has"):
+        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "cartpole.zip"})
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
+        archive.writestr("data", "{}")
+    with pytest.raises(ValueError, match="algorithm cannot be told: pass the model itself"):
+        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "empty.zip"})
+
+
+def test_partners_with_a_state_are_told_of_episodes():
+    counting = Counting()
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": counting}, deterministic=True)
+    others_did(env, 16)
+    assert counting.calls == [(t % 7, t % 7 == 0, True) for t in range(16)]
+
+
+def test_masked_partners_get_their_masks():
+    """``MaskedEnv`` raises if anybody does what its mask forbids."""
+
+    def allowed(obs, action_masks):
+        return int(np.flatnonzero(action_masks)[0])
+
+    class Predicts:
+        def predict(self, obs, state=None, episode_start=None, deterministic=False, action_masks=None):
+            return int(np.flatnonzero(action_masks)[0]), None
+
+    make = partial(MaskedEnv, n_agents=3)
+    for partner in (allowed, Predicts()):
+        env = AgentEnv(make, "agent_0", {"agent_1": partner, "agent_2": zero})
+        env.reset(seed=0)
+        for t in range(7):
+            assert env.action_masks().dtype == bool and env.action_masks().tolist() == [k == t % 3 for k in range(3)]
+            assert env.step(t % 3)[4]["others_actions"][:3].tolist() == [k == (t + 1) % 3 for k in range(3)]
+    # the last agent has none of its own
+    unmasked = AgentEnv(make, "agent_2", {"agent_0": allowed, "agent_1": allowed})
+    unmasked.reset()
+    assert unmasked.action_masks().all()
+    bare = AgentEnv(toy(2), "agent_0", {"agent_1": zero})
+    bare.reset()
+    assert not hasattr(bare, "action_masks")
+
+
+def test_a_masked_learner_and_a_masked_partner(tmp_path):
+    make = partial(MaskedEnv, n_agents=3)
+    team = Team(MaskableBeliefPPO, "BeliefPolicy", make_team_env(make), seed=0, **BELIEF)
+    team.learn(16)
+    team.save(tmp_path / "team.zip")
+    env = DummyVecEnv([lambda: AgentEnv(make, "agent_0", tmp_path / "team.zip")] * 2)
+    model = MaskableBeliefPPO("BeliefPolicy", env, seed=0, **BELIEF).learn(32)
+    assert model.num_timesteps == 32
+    # a new environment, asked for its masks before its first reset
+    env = AgentEnv(make, "agent_0", tmp_path / "team.zip")
+    _, lengths = evaluate_masked(model, env, n_eval_episodes=2, return_episode_rewards=True, warn=False)
+    assert lengths == [7, 7]
+
+
+# Learning
+
+
+def test_it_takes_the_place_of_a_team_for_one_learner(tmp_path):
+    trained(tmp_path / "team.zip", algo=BeliefPPO, **{k: v for k, v in BELIEF.items() if k not in PPO_KWARGS})
+    env = AgentEnv(toy(2), "agent_0", tmp_path / "team.zip")
+    model = BeliefPPO("BeliefPolicy", env, seed=0, **BELIEF).learn(40)
+    assert list(model.others_action_spaces) == ["agent_1"] and "belief/action_loss" in model.logger.name_to_value
+    assert model.policy.history is not None and len(model.policy.history.observations) == 16
+    model.save(tmp_path / "learner")
+    again = BeliefPPO.load(tmp_path / "learner", env=env)
+    assert np.isfinite(evaluate_policy(again, env, n_eval_episodes=2, warn=False)[0])
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_partners_are_swapped_during_training(tmp_path, vec_env_cls):
+    trained(tmp_path / "team.zip")
+    env = make_vec_env(
+        AgentEnv,
+        n_envs=2,
+        seed=0,
+        env_kwargs={"parallel_env": toy(2), "agent": "agent_0", "partners": {"agent_1": str(tmp_path / "team.zip")}},
+        vec_env_cls=vec_env_cls,
+    )
+    model = BeliefPPO("BeliefPolicy", env, seed=0, **BELIEF).learn(32)
+    for partner, expected in ((zero, 0), (one, 1)):
+        env.env_method("set_partner", "agent_1", partner)
+        for _ in range(3):
+            infos = env.step(np.zeros(2, int))[3]
+            assert [info["others_actions"].argmax() for info in infos] == [expected] * 2
+    model.learn(32, reset_num_timesteps=False)
+    assert model.num_timesteps == 64
+    env.close()
+
+
+def test_the_learner_does_not_depend_on_its_partners_random_numbers():
+    """In the toy agents do not influence each other: whoever the partner is, the learner learns the same."""
+
+    def noisy(obs):
+        return np.random.randint(3)
+
+    results = []
+    for partner in (noisy, zero, PPO("MlpPolicy", AgentEnv(toy(1), "agent_0", {}), **PPO_KWARGS)):
+        env = AgentEnv(toy(2), "agent_0", {"agent_1": partner})
+        model = PPO("MlpPolicy", env, seed=0, **PPO_KWARGS)
+        model.learn(8)
+        env.set_partner("agent_1", partner)
+        results.append(parameters(model.learn(24, reset_num_timesteps=False)))
+    assert all((result == results[0]).all() for result in results)
+
+
+def test_seeded_partners_sample_the_same_again(tmp_path):
+    trained(tmp_path / "team.zip")
+    env = AgentEnv(toy(2), "agent_0", tmp_path / "team.zip")
+    first, second, other = (others_did(env, seed=seed) for seed in (4, 4, 5))
+    assert np.array_equal(first, second) and not np.array_equal(first, other)
+
+
+def test_normalised_models_keep_their_statistics():
+    env = VecNormalize(DummyVecEnv([lambda: AgentEnv(toy(1), "agent_0", {})]))
+    model = PPO("MlpPolicy", env, seed=0, **PPO_KWARGS).learn(64)
+    seen: list[np.ndarray] = []
+    predict = model.predict
+    model.predict = lambda obs, *args, **kwargs: (seen.append(obs), predict(obs, *args, **kwargs))[1]  # type: ignore
+    joint = AgentEnv(toy(2), "agent_0", {"agent_1": model})
+    joint.reset(seed=0)
+    raw = joint.parallel_env.observations()["agent_1"]
+    joint.step(0)
+    assert np.array_equal(seen[0], np.asarray(env.normalize_obs(raw))) and not np.allclose(seen[0], raw)
+
+
+def test_scripted_others_come_after_the_partners():
+    env = AgentEnv(PartneredEnv, "arrow", {"ball": lambda obs: np.array([0.5], np.float32)})
+    assert list(env.others_action_spaces) == ["ball", "wind", "leader"]
+    env.reset(seed=0)
+    assert env.step(0)[4]["others_actions"].tolist() == [0.5, 1, -1, 1, 0, 0, 0]
