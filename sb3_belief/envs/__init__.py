@@ -1,4 +1,4 @@
-"""Environments: a registry of ids, this package's own PettingZoo environments, and adapters to those of other packages."""
+"""Environments: a registry of ids, the PettingZoo environments of this package, and adapters to those of other packages."""
 
 from sb3_belief.envs.adapters.pettingzoo import to_parallel
 from sb3_belief.envs.env_checker import check_team_env
@@ -7,7 +7,7 @@ from sb3_belief.envs.suites import SUITES, Suite
 from sb3_belief.envs.switching_convention import SwitchingConvention
 from sb3_belief.envs.traffic_junction import TrafficJunction
 
-# Their first names, which stay
+# Earlier names of the two, which stay importable
 FAMILIES, Family = SUITES, Suite
 
 __all__ = [

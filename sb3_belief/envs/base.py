@@ -1,4 +1,4 @@
-"""What the PettingZoo environments and adapters of this package have in common."""
+"""Base classes and checks that the PettingZoo environments and adapters of this package share."""
 
 from collections.abc import Sequence
 from typing import Generic, TypeVar
@@ -12,7 +12,9 @@ Act = TypeVar("Act")
 
 class TeamGame(ParallelEnv[str, Obs, Act], Generic[Obs, Act]):
     """
-    A ``ParallelEnv`` whose spaces lie in ``observation_spaces`` and ``action_spaces``, by agent; a subclass fills them.
+    Base class of a ``ParallelEnv`` that keeps its spaces in two dictionaries by agent.
+
+    A subclass fills ``observation_spaces``, ``action_spaces`` and ``render_mode`` in its constructor.
     """
 
     observation_spaces: dict[str, spaces.Space]
@@ -21,45 +23,60 @@ class TeamGame(ParallelEnv[str, Obs, Act], Generic[Obs, Act]):
 
     def observation_space(self, agent: str) -> spaces.Space:
         """
-        :param agent: its name
-        :return: its observation space, always the same object
+        Return the observation space of an agent.
+
+        :param agent: Name of the agent
+        :return: The same object at every call, as PettingZoo requires
         """
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space:
         """
-        :param agent: its name
-        :return: its action space, always the same object
+        Return the action space of an agent.
+
+        :param agent: Name of the agent
+        :return: The same object at every call, as PettingZoo requires
         """
         return self.action_spaces[agent]
 
     def _require_episode(self) -> None:
         """
-        :raises ValueError: before the first ``reset`` and after an episode's end
+        Check that an episode is under way.
+
+        :raises ValueError: Before the first ``reset`` and after the end of an episode
         """
         if not self.agents:
             raise ValueError("No episode is under way: call reset() before the first step and after an episode's end.")
 
 
-class UnitsGame(TeamGame[Obs, int], Generic[Obs]):
-    """Battles: a common reward, and the dead stay listed, so that every agent acts at each step in ``Discrete`` actions."""
+class BattleGame(TeamGame[Obs, int], Generic[Obs]):
+    """
+    Base class of the StarCraft-like battles (SMAC, SMACv2, SMAX).
+
+    All agents share one reward and have ``Discrete`` actions. Dead agents stay in ``agents`` until the battle ends, so every
+    agent needs an action at each step.
+    """
 
     def team_reward(self, rewards: dict[str, float]) -> float:
         """
-        :param rewards: what ``step`` returned
-        :return: the reward that all of them have in common
+        Return the reward that all agents share.
+
+        :param rewards: Rewards by agent, as ``step`` returned them
+        :return: The reward of any one of them
         """
         return rewards[self.possible_agents[0]]
 
-    def _chosen(self, agent: str, actions: dict[str, int]) -> int:
+    def _checked_action(self, agent: str, actions: dict[str, int]) -> int:
         """
-        :param agent: its name
-        :param actions: of all agents
-        :return: its action
-        :raises ValueError: if it is missing or not in its space
+        Return the action of an agent as a plain integer.
+
+        :param agent: Name of the agent
+        :param actions: Actions of all agents
+        :return: The agent's action
+        :raises ValueError: If the action is missing or outside the agent's action space
         """
         if agent not in actions:
-            raise ValueError(f"No action for {agent!r}: every agent needs one at each step, also a dead one.")
+            raise ValueError(f"No action for {agent!r}: every agent needs one at each step, including a dead one.")
         action, space = actions[agent], self.action_spaces[agent]
         if not space.contains(action):
             n_actions = space.n  # type: ignore[attr-defined]
@@ -69,10 +86,12 @@ class UnitsGame(TeamGame[Obs, int], Generic[Obs]):
 
 def check_render_mode(render_mode: str | None, modes: Sequence[str]) -> str | None:
     """
-    :param render_mode: what the user gave
-    :param modes: what there is
-    :return: the same
-    :raises ValueError: if there is no such mode
+    Check that a render mode exists.
+
+    :param render_mode: The mode that the user asked for, or None
+    :param modes: The modes of the environment
+    :return: ``render_mode``, unchanged
+    :raises ValueError: If the environment has no such mode
     """
     if render_mode is not None and render_mode not in modes:
         raise ValueError(f"render_mode={render_mode!r} is not one of None, {', '.join(map(repr, modes))}.")
@@ -81,10 +100,12 @@ def check_render_mode(render_mode: str | None, modes: Sequence[str]) -> str | No
 
 def require_render_mode(render_mode: str | None, modes: Sequence[str]) -> str:
     """
-    :param render_mode: with which an environment was made
-    :param modes: what there is
-    :return: the same
-    :raises ValueError: if it was made without one
+    Check that an environment was made with a render mode.
+
+    :param render_mode: The mode that the environment was made with
+    :param modes: The modes of the environment, for the message
+    :return: ``render_mode``, unchanged
+    :raises ValueError: If it is None
     """
     if render_mode is None:
         raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {tuple(modes)}.")

@@ -1,4 +1,4 @@
-"""Does an environment keep the contract of a team? Found by playing it, and every fault said with what to change."""
+"""Check by random play whether an environment keeps the contract of a team, and report each fault with what to change."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,9 +17,11 @@ from sb3_belief.vec_env.team_vec_env import check_spaces
 @dataclass(frozen=True)
 class Finding:
     """
-    :param topic: what was looked at
-    :param verdict: ``"ok"``, ``"note"`` (allowed, but worth to know) or ``"FAIL"``
-    :param text: what was found; for a failure also what to change
+    One line of a :class:`Report`.
+
+    :param topic: The part of the contract that was checked
+    :param verdict: ``"ok"``, ``"note"`` (allowed, but worth knowing) or ``"FAIL"``
+    :param text: What was observed and, for a failure, what to change
     """
 
     topic: str
@@ -33,23 +35,25 @@ class Finding:
 @dataclass
 class Report:
     """
-    :param findings: in the order in which they were made
+    The findings about one environment.
+
+    :param findings: Findings in the order in which they were made
     """
 
     findings: list[Finding] = field(default_factory=list)
 
     @property
     def failures(self) -> list[Finding]:
-        """
-        :return: what has to be changed
-        """
+        """The findings that require a change of the environment."""
         return [finding for finding in self.findings if finding.verdict == "FAIL"]
 
     def add(self, topic: str, verdict: str, text: str) -> None:
         """
-        :param topic: see :class:`Finding`
-        :param verdict: see :class:`Finding`
-        :param text: see :class:`Finding`
+        Append a finding.
+
+        :param topic: See :class:`Finding`
+        :param verdict: See :class:`Finding`
+        :param text: See :class:`Finding`
         """
         self.findings.append(Finding(topic, verdict, text))
 
@@ -62,54 +66,58 @@ def check_team_env(
     env: str | Callable[..., ParallelEnv], env_kwargs: Mapping[str, Any] | None = None, n_steps: int = 500, seed: int = 0
 ) -> Report:
     """
-    Play an environment with random actions, those that its masks allow, and check what a team needs of it: spaces, names,
-    seeding, masks, visibility, ``active``, ``life_end``, ends of episodes, infos, pickling.
+    Check an environment by playing it with random actions that its masks allow.
 
-    :param env: what ``make_team_env`` takes: an id, or a callable that returns a PettingZoo ``ParallelEnv``
-    :param env_kwargs: keyword arguments of the environment
-    :param n_steps: how long to play, at least 2 steps
-    :param seed: of the environment
-    :return: the findings; ``print(report)`` shows them
-    :raises ValueError: for an unknown id or too few steps
-    :raises ModuleNotFoundError: if the package of an id is not installed
+    The check covers what a team needs: spaces, names of agents, seeding, masks, visibility, ``active``, ``life_end``, ends of
+    episodes, infos, saving and restoring the state, and pickling.
+
+    :param env: An id, or a callable that returns a PettingZoo ``ParallelEnv``, as ``make_team_env`` takes them
+    :param env_kwargs: Keyword arguments of the environment
+    :param n_steps: Number of steps to play, at least 2
+    :param seed: Seed of the environment's first reset
+    :return: The findings. ``print(report)`` shows them
+    :raises ValueError: For an unknown id or too few steps
+    :raises ModuleNotFoundError: If the package of an id is not installed
     """
     if n_steps < 2:
         raise ValueError(f"n_steps={n_steps} must be at least 2.")
     kwargs = dict(env_kwargs or {})
     make = spec(env).maker(**kwargs) if isinstance(env, str) else partial(env, **kwargs)
     report = Report()
-    first = _make(make, report)
+    first = _make_env(make, report)
     if first is None:
         return report
     try:
-        if _check_spaces(first, report):
-            # Nothing further can be played if this fails
-            found = play_randomly(first, n_steps, seed)
-            for topic, text in found.faults.items():
+        # An environment with faulty spaces cannot be played, so the report ends there
+        if _report_spaces(first, report):
+            record = play_randomly(first, n_steps, seed)
+            for topic, text in record.faults.items():
                 report.add(topic, "FAIL", text)
-            if "play" not in found.faults:
-                _check_seeding(make, first, found, seed, report)
-                _describe(found, report)
-                _check_state(first, seed, report)
-            _check_pickling(make, report)
+            # With the fault "play" the environment could not be stepped, so there is nothing to compare or describe
+            if "play" not in record.faults:
+                _report_seeding(make, first, record, seed, report)
+                _report_play(record, report)
+                _report_state(first, seed, report)
+            _report_pickling(make, report)
     finally:
         first.close()
     return report
 
 
-def _make(make: Callable[[], Any], report: Report) -> ParallelEnv | None:
+def _make_env(make: Callable[[], Any], report: Report) -> ParallelEnv | None:
     try:
         env = make()
     except Exception as error:
-        report.add("making", "FAIL", f"it raises {_said(error)}. Change: what is called must return an environment.")
+        report.add("making", "FAIL", f"it raises {_describe_error(error)}. Change: the callable must return an environment.")
         return None
     if isinstance(env, AECEnv):
         change = "wrap it: sb3_belief.envs.to_parallel(env)"
-        report.add("making", "FAIL", f"it is an AEC environment, agents act in turn. Change: {change}.")
+        report.add("making", "FAIL", f"it is an AEC environment, in which agents act in turn. Change: {change}.")
     elif not isinstance(env, ParallelEnv):
         change = "return an object of a subclass of pettingzoo.ParallelEnv"
         report.add("making", "FAIL", f"it returns a {type(env).__name__}. Change: {change}.")
     else:
+        # Copies that are one and the same object would step each other
         other = make()
         if other is not env:
             other.close()
@@ -118,117 +126,121 @@ def _make(make: Callable[[], Any], report: Report) -> ParallelEnv | None:
     return None
 
 
-def _check_spaces(env: ParallelEnv, report: Report) -> bool:
+def _report_spaces(env: ParallelEnv, report: Report) -> bool:
     try:
         agents = list(env.possible_agents)
         observation_spaces = {agent: env.observation_space(agent) for agent in agents}
         action_spaces = {agent: env.action_space(agent) for agent in agents}
         check_spaces(agents, observation_spaces, action_spaces, ScriptedOthers(env).action_spaces)
     except Exception as error:
-        change = "possible_agents, observation_space(agent) and action_space(agent) must be there once the environment is made"
-        report.add("spaces", "FAIL", f"{_said(error)}. Change: {change}, with spaces that a team can have.")
+        change = "define possible_agents, observation_space(agent) and action_space(agent) before the first reset"
+        report.add("spaces", "FAIL", f"{_describe_error(error)}. Change: {change}, with spaces that a team supports.")
         return False
     for agent in agents:
         if env.observation_space(agent) != observation_spaces[agent] or env.action_space(agent) != action_spaces[agent]:
-            report.add("spaces", "FAIL", f"those of {agent!r} differ from call to call. Change: make them once, return these.")
+            change = "make them once and return the same objects"
+            report.add("spaces", "FAIL", f"those of {agent!r} differ from call to call. Change: {change}.")
             return False
     kinds = {(str(observation_spaces[agent]), str(action_spaces[agent])) for agent in agents}
     report.add("spaces", "ok", f"{len(agents)} agents, {len(kinds)} kind{'s' if len(kinds) > 1 else ''} of spaces")
     return True
 
 
-def _check_seeding(make: Callable[[], Any], env: ParallelEnv, found: PlayRecord, seed: int, report: Report) -> None:
-    n_steps = min(sum(entry[0] != "reset" for entry in found.trace), 60)
+def _report_seeding(make: Callable[[], Any], env: ParallelEnv, record: PlayRecord, seed: int, report: Report) -> None:
+    n_steps = min(sum(entry[0] != "reset" for entry in record.trace), 60)
     try:
+        # The same environment reveals what an episode leaves behind, a new one what depends on the process or the instance
         again = play_randomly(env, n_steps, seed).trace
         other = make()
         fresh = play_randomly(other, n_steps, seed).trace
         different = play_randomly(other, n_steps, seed + 1).trace
         other.close()
     except Exception as error:
-        report.add("seeding", "FAIL", f"a further episode raises {_said(error)}. Change: reset() must begin anew at any time.")
+        change = "reset() must start a new episode at any time"
+        report.add("seeding", "FAIL", f"a further episode raises {_describe_error(error)}. Change: {change}.")
         return
-    change = "reset(seed=s) must set every generator and clear all that an episode has left behind"
+    change = "reset(seed=s) must seed every generator and clear everything that an episode has left behind"
     for trace, what in ((again, "when the same environment is reset with it again"), (fresh, "in a new environment")):
-        step = next((t for t, (a, b) in enumerate(zip(found.trace, trace, strict=False)) if a != b), None)
+        # The traces may differ in length: the first one is the whole play, the others are cut after n_steps
+        step = next((t for t, (a, b) in enumerate(zip(record.trace, trace, strict=False)) if a != b), None)
         if step is not None:
             when = f"from step {step} on" if step else "from the reset on"
-            report.add("seeding", "FAIL", f"the same seed and actions give something else {when}, {what}. Change: {change}.")
+            text = f"the same seed and actions give something else {when}, {what}"
+            report.add("seeding", "FAIL", f"{text}. Change: {change}.")
             return
     same = " (another seed gives the same too: nothing is random)" if different == fresh else ""
     report.add("seeding", "note" if same else "ok", f"the same seed and actions give the same {n_steps} steps{same}")
 
 
-def _describe(found: PlayRecord, report: Report) -> None:
-    """What was seen of the parts of the contract that have no fault."""
-    faults = found.faults
+def _report_play(record: PlayRecord, report: Report) -> None:
+    """Describe what was observed of each part of the contract that has no fault."""
+    faults = record.faults
     if "names" not in faults:
         report.add("names", "ok", "agents keep theirs")
     if "observations" not in faults:
         report.add("observations", "ok", "all in their spaces")
     if "rewards" not in faults:
-        report.add("rewards", "ok", f"from {min(found.rewards):.3g} to {max(found.rewards):.3g}")
+        report.add("rewards", "ok", f"from {min(record.rewards):.3g} to {max(record.rewards):.3g}")
     if "masks" not in faults:
-        report.add("masks", "ok", found.mask_summary())
+        report.add("masks", "ok", record.mask_summary())
     if "visibility" not in faults:
-        report.add("visibility", *found.visibility_summary())
+        report.add("visibility", *record.visibility_summary())
     if "flags" not in faults:
-        report.add(
-            "flags",
-            "ok",
-            f"inactive in {found.inactive} of {found.acted} actions, {found.life_ends} ends of a life within an episode",
-        )
+        life_ends = f"life_end {record.life_ends} times within an episode"
+        report.add("flags", "ok", f"inactive in {record.n_inactive} of {record.n_actions} actions, {life_ends}")
     if "infos" not in faults:
-        report.add("infos", "ok", f"keys of others than this contract: {', '.join(sorted(found.other_keys)) or 'none'}")
+        report.add("infos", "ok", f"keys outside this contract: {', '.join(sorted(record.other_keys)) or 'none'}")
     if "ends" not in faults:
-        report.add("ends", *found.ends_summary())
+        report.add("ends", *record.ends_summary())
 
 
-def _check_state(env: ParallelEnv, seed: int, report: Report) -> None:
+def _report_state(env: ParallelEnv, seed: int, report: Report) -> None:
     get_state, set_state = optional_member(env, "get_state"), optional_member(env, "set_state")
     if get_state is None or set_state is None:
-        report.add("state", "note", "no get_state() and set_state(): runs can go on, but not exactly where they stopped")
+        report.add("state", "note", "no get_state() and set_state(): a saved run can be resumed, but not exactly")
         return
-    change = "get_state() must return all that decides how it goes on, as copies; set_state() must take that back"
+    change = "get_state() must return all that decides the following steps, as copies; set_state() must restore it"
     player = RandomPlayer(env, seed=0)
     try:
         player.reset(seed)
         player.step()
         if not env.agents:
             player.reset(None)
-        masks, rng = player.masks, player.rng.bit_generator.state
-        # As it is when a run is saved and loaded
+        masks, rng_state = player.masks, player.rng.bit_generator.state
+        # The state goes through pickle, as it does when a run is saved and loaded
         state = cloudpickle.loads(cloudpickle.dumps(get_state()))
-        first = _go_on(player)
+        first = _continue_play(player)
         set_state(state)
-        player.masks, player.rng.bit_generator.state = masks, rng
-        second = _go_on(player)
+        # The player's own state is restored too, so that it chooses the same actions again
+        player.masks, player.rng.bit_generator.state = masks, rng_state
+        second = _continue_play(player)
     except Exception as error:
-        report.add("state", "FAIL", f"raises {_said(error)}. Change: {change}.")
+        report.add("state", "FAIL", f"raises {_describe_error(error)}. Change: {change}.")
         return
     if first != second:
         report.add("state", "FAIL", f"after set_state() the same actions give something else. Change: {change}.")
     else:
-        report.add("state", "ok", "set_state() brings it back to where get_state() was called")
+        report.add("state", "ok", "set_state() restores the environment to where get_state() was called")
 
 
-def _go_on(player: RandomPlayer) -> list[tuple]:
-    start = len(player.found.trace)
+def _continue_play(player: RandomPlayer) -> list[tuple]:
+    start = len(player.record.trace)
     for _ in range(5):
         if not player.env.agents or not player.step():
             break
-    return player.found.trace[start:]
+    return player.record.trace[start:]
 
 
-def _check_pickling(make: Callable[[], Any], report: Report) -> None:
+def _report_pickling(make: Callable[[], Any], report: Report) -> None:
     try:
         cloudpickle.loads(cloudpickle.dumps(make))().close()
     except Exception as error:
-        change = "let the callable and its arguments be plain (no open files, locks or environments in them)"
-        report.add("pickling", "FAIL", f"what makes it cannot be sent to a worker process: {_said(error)}. Change: {change}.")
+        change = "keep open files, locks and environments out of the callable and its arguments"
+        text = f"the callable cannot be sent to a worker process: {_describe_error(error)}"
+        report.add("pickling", "FAIL", f"{text}. Change: {change}.")
     else:
         report.add("pickling", "ok", "worker processes can make it")
 
 
-def _said(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".rstrip(".")

@@ -1,4 +1,4 @@
-"""Make the vectorised environment of a team from an id or from one's own PettingZoo environment."""
+"""Make the vectorised environment of a team from an id or from a PettingZoo environment of the user's own."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -24,22 +24,24 @@ def make_team_env(
     """
     Make ``n_envs`` copies of a team environment as one SB3 ``VecEnv``.
 
-    :param env: an id (``"traffic-junction-medium"``, ``"mpe/simple_spread_v3"``, ``"module:callable"``; ``sb3-belief envs``
-        lists them), or a callable (class or function) that returns a new PettingZoo ``ParallelEnv``
-    :param n_envs: number of copies, at least 1
-    :param seed: copy i gets ``seed + i`` at its first reset; None: unseeded (a ``Team`` with a seed seeds them)
-    :param vec_env: "dummy" steps the copies in this process (all at once where the environment has a batched class),
-        "subproc" has one worker process per copy; these start afresh, so a script needs ``if __name__ == "__main__":``
-    :param env_kwargs: keyword arguments of the environment
-    :param wrapper: applied to each copy's ``ParallelEnv`` before its agents are split
-    :param visibility: for an environment that does not say itself, by a method ``visibility()``, whose actions an agent
-        could observe: called with each copy's ``ParallelEnv`` after each step, it returns {agent: bool [n_others]}, the others
-        in the order of ``possible_agents``. None: everyone sees everyone in play.
-    :return: the vectorised environment
-    :raises TypeError: if ``env`` is an environment instead of what makes one
-    :raises ValueError: for an unknown id, an unknown ``vec_env``, ``n_envs < 1``, or ``visibility`` for an environment that
-        says it itself
-    :raises ModuleNotFoundError: if the package of an id is not installed, with the line that installs it
+    :param env: An id (``"traffic-junction-medium"``, ``"mpe/simple_spread_v3"``, ``"module:callable"``; the command
+        ``sb3-belief envs`` lists them), or a callable (class or function) that returns a new PettingZoo ``ParallelEnv``
+    :param n_envs: Number of environment copies, at least 1
+    :param seed: Copy i is seeded with ``seed + i`` at its first reset. With None the copies are unseeded (a ``Team`` with a
+        seed then seeds them)
+    :param vec_env: ``"dummy"`` steps the copies in this process, all at once where the environment has a batched class.
+        ``"subproc"`` runs each copy in a worker process of its own. Workers import the calling script, which therefore needs
+        ``if __name__ == "__main__":``
+    :param env_kwargs: Keyword arguments of the environment
+    :param wrapper: Wrapper that is applied to the ``ParallelEnv`` of each copy
+    :param visibility: Which actions each agent could observe, for an environment that has no method ``visibility()``. The
+        callable is given the ``ParallelEnv`` of each copy after each step and returns {agent: bool [n_others]}, the others in
+        the order of ``possible_agents``. With None every agent sees the actions of all agents in play
+    :return: The vectorised environment
+    :raises TypeError: If ``env`` is an environment instead of a callable that makes one
+    :raises ValueError: For an unknown id, an unknown ``vec_env``, ``n_envs < 1``, or ``visibility`` for an environment that
+        has a method ``visibility()``
+    :raises ModuleNotFoundError: If the package of an id is not installed. The message has the line that installs it
     """
     if vec_env not in ("dummy", "subproc"):
         raise ValueError(f"vec_env must be 'dummy' or 'subproc', got {vec_env!r}.")
@@ -49,9 +51,10 @@ def make_team_env(
 
     team_env: TeamVecEnv | None = None
     if isinstance(env, str):
+        # A batched class has no ParallelEnv per copy to which a wrapper or a visibility function could be applied
         if vec_env == "dummy" and wrapper is None and visibility is None:
             team_env = make_batched_env(env, n_envs, **kwargs)
-        # Looked up here: a worker process need not know what was registered in this one
+        # The id is looked up in this process, because ids registered here are unknown in a worker process
         make_one = spec(env).maker(**kwargs)
     elif callable(env) and not isinstance(env, ParallelEnv):
         make_one = partial(env, **kwargs)

@@ -1,12 +1,15 @@
 """
-The environments that have an id, and how users give theirs one.
+The registry of environments: which ids exist, and how users register environments of their own.
 
-Four kinds of ids: this package's own games (``traffic-junction-medium``), what users register (``register``, or the entry
-point group ``sb3_belief.envs`` of an installed package), ``family/name`` for environments of other packages
-(``mpe/simple_spread_v3``, see ``suites``), and ``module:callable`` for anything that can be imported.
+There are four kinds of ids:
 
-Classes are named by ``"module:attribute"`` strings and imported when they are asked for, so that looking at the registry
-needs none of the optional packages that an environment may need.
+- those of this package's own environments (``traffic-junction-medium``)
+- those that users register, with ``register`` or by the entry point group ``sb3_belief.envs`` of an installed package
+- ``suite/name`` for environments of other packages (``mpe/simple_spread_v3``, see ``suites``)
+- ``module:callable`` for anything that can be imported
+
+The registry holds ``"module:attribute"`` strings and imports a class only when an environment is made. Looking up an id
+therefore needs none of the optional packages that an environment may need.
 """
 
 import re
@@ -20,7 +23,7 @@ from typing import Any, TypeVar
 
 from pettingzoo import ParallelEnv
 
-from sb3_belief.envs.suites import SUITES, Suite, listed, load, nearest
+from sb3_belief.envs.suites import SUITES, Suite, comma_separated, load_attribute, nearest
 from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
 ENTRY_POINT_GROUP = "sb3_belief.envs"
@@ -34,60 +37,70 @@ _CALLABLE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 @dataclass(frozen=True)
 class EnvSpec:
     """
-    How to make an environment.
+    Description of how to make an environment.
 
-    :param id: the name users type
-    :param parallel: a callable that takes the keyword arguments and returns a PettingZoo ``ParallelEnv``, or the
-        ``"module:attribute"`` of one
-    :param kwargs: keyword arguments that the id stands for; the user's own override them
+    :param id: Name that users type
+    :param parallel: Callable that takes the keyword arguments and returns a PettingZoo ``ParallelEnv``, or the
+        ``"module:attribute"`` of such a callable
+    :param kwargs: Keyword arguments that the id stands for. Those of the user override them
     :param batched: ``"module:attribute"`` of a callable ``(n_envs, **kwargs)`` that returns a ``TeamVecEnv`` stepping all its
-        copies at once, or None if the environment has no such class
-    :param family: where it comes from, None for what needs no further package; its callables get the name first
+        copies at once. None if the environment has no such class
+    :param suite: Suite that the environment belongs to, or None if it needs no further package. The callables of a suite take
+        the environment's name as their first argument
     """
 
     id: str
     parallel: str | Callable[..., ParallelEnv]
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     batched: str | None = None
-    family: Suite | None = None
+    suite: Suite | None = None
 
     def __post_init__(self) -> None:
+        # The usual assignment is not possible in a frozen dataclass
         object.__setattr__(self, "kwargs", MappingProxyType(dict(self.kwargs)))
 
     @property
+    def family(self) -> Suite | None:
+        """The suite, under its earlier name."""
+        return self.suite
+
+    @property
     def leading(self) -> tuple[str, ...]:
-        """
-        :return: the positional arguments that come before all others
-        """
-        return () if self.family is None else (self.id.partition("/")[2],)
+        """The positional arguments of the callables: the environment's name for one of a suite, otherwise none."""
+        return () if self.suite is None else (self.id.partition("/")[2],)
 
     def load(self) -> Callable[..., ParallelEnv]:
         """
-        :return: the callable that makes one copy; it takes ``leading`` and the keyword arguments
-        :raises ModuleNotFoundError: if its package is not installed, with the line that installs it
-        :raises ValueError: if a ``module:callable`` names nothing that can be called
+        Import and return the callable that makes one copy of the environment.
+
+        :return: Callable that takes ``leading`` and the keyword arguments
+        :raises ModuleNotFoundError: If its package is not installed. The message has the line that installs it
+        :raises ValueError: If a ``module:callable`` names nothing that can be called
         """
-        if self.family is not None:
-            self.family.require(self.id)
+        if self.suite is not None:
+            self.suite.require(self.id)
         if not isinstance(self.parallel, str):
             return self.parallel
         if self.parallel != self.id:
-            return load(self.parallel)
+            return load_attribute(self.parallel)
+        # The user typed this "module:callable", so a mistake in it is reported as a wrong id
         try:
-            found = load(self.parallel)
+            make = load_attribute(self.parallel)
         except (ModuleNotFoundError, AttributeError) as error:
             module, _, attribute = self.id.partition(":")
             raise ValueError(
                 f"{self.id!r} stands for {attribute!r} of the module {module!r}, which cannot be imported: {error}."
             ) from error
-        if not callable(found):
-            raise ValueError(f"{self.id!r} is a {type(found).__name__}, not a callable that returns a PettingZoo ParallelEnv.")
-        return found
+        if not callable(make):
+            raise ValueError(f"{self.id!r} is a {type(make).__name__}, not a callable that returns a PettingZoo ParallelEnv.")
+        return make
 
     def maker(self, **env_kwargs: Any) -> Callable[[], ParallelEnv]:
         """
-        :param env_kwargs: keyword arguments of the environment; they override those of the id
-        :return: a callable that returns one copy each time; worker processes can be given it
+        Return a callable without arguments that makes one copy of the environment.
+
+        :param env_kwargs: Keyword arguments of the environment. They override those of the id
+        :return: Callable that returns a new copy at each call. It can be sent to a worker process
         """
         return partial(_call, self.load(), self.leading, {**self.kwargs, **env_kwargs})
 
@@ -127,7 +140,7 @@ _SPECS |= {
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """
-    Give an environment of one's own an id, for as long as the process lives::
+    Register an environment of the user's own under an id, in this process::
 
         @register("my-game")
         class MyGame(ParallelEnv):
@@ -135,19 +148,19 @@ def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | No
 
         env = make_team_env("my-game", n_envs=8)
 
-    A package that is to bring its environments wherever it is installed names them in its ``setup.cfg`` instead, and then
-    the command line knows them too::
+    A package can instead name its environments in its ``setup.cfg``. They are then registered wherever the package is
+    installed, and the command line knows them too::
 
         [options.entry_points]
         sb3_belief.envs =
             my-game = my_package.games:MyGame
 
-    :param id: letters, digits, ``_``, ``.`` and ``-``, with slashes between; not of one of the families
-    :param kwargs: keyword arguments that the id stands for; the user's own override them
-    :param batched: see :class:`EnvSpec`
-    :return: a decorator for a class or function that returns a PettingZoo ``ParallelEnv``; it returns what it was given
-    :raises ValueError: for an id that cannot be, or that is another environment's
-    :raises TypeError: if what it decorates cannot be called
+    :param id: Letters, digits, ``_``, ``.`` and ``-``, with slashes between them. It must not begin with the name of a suite
+    :param kwargs: Keyword arguments that the id stands for. Those of the user override them
+    :param batched: See :class:`EnvSpec`
+    :return: A decorator for a class or function that returns a PettingZoo ``ParallelEnv``. It returns its argument unchanged
+    :raises ValueError: If the id has another form, or another environment has it already
+    :raises TypeError: If the decorated object cannot be called
     """
     _check_id(id)
 
@@ -155,7 +168,7 @@ def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | No
         if not callable(make):
             raise TypeError(f"register({id!r}) needs a class or function that makes a ParallelEnv, got {type(make).__name__}.")
         old = _SPECS.get(id)
-        # The cell of a notebook that is run again defines the same environment anew
+        # A notebook cell that is run again defines the same environment once more, which is allowed
         if old is not None and (isinstance(old.parallel, str) or _origin(old.parallel) != _origin(make)):
             raise ValueError(f"The id {id!r} is another environment's already: choose a different one.")
         _SPECS[id] = EnvSpec(id, make, kwargs or {}, batched)
@@ -165,49 +178,58 @@ def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | No
 
 
 def _origin(make: Any) -> tuple[Any, Any]:
+    # A callable without a name, such as a partial, is the same only as the same object
     return getattr(make, "__module__", None), getattr(make, "__qualname__", id(make))
 
 
 def _check_id(id: str) -> None:
     if not isinstance(id, str) or not _ID.fullmatch(id):
         raise ValueError(f"{id!r} cannot be an id: allowed are letters, digits, '_', '.' and '-', with slashes between.")
-    family = id.partition("/")[0]
-    if family in SUITES:
-        raise ValueError(f"The id {id!r} is of the family {family!r}: choose one that does not begin with {family + '/'!r}.")
+    prefix = id.partition("/")[0]
+    if prefix in SUITES:
+        raise ValueError(
+            f"The id {id!r} belongs to the suite {prefix!r}: choose one that does not begin with {prefix + '/'!r}."
+        )
 
 
 @cache
 def _installed_specs() -> dict[str, EnvSpec]:
     """
-    :return: what installed packages register by entry points; nothing of them is imported
+    Return the specifications that installed packages register by entry points, without importing the packages.
+
+    :return: {id: specification}. A faulty entry point is left out with a warning
     """
-    found: dict[str, EnvSpec] = {}
+    specs: dict[str, EnvSpec] = {}
     for point in metadata.entry_points(group=ENTRY_POINT_GROUP):
         try:
             _check_id(point.name)
-            if point.name in _SPECS or point.name in found:
+            if point.name in _SPECS or point.name in specs:
                 raise ValueError(f"The id {point.name!r} is another environment's already.")
             if not _CALLABLE.fullmatch(point.value):
                 raise ValueError(f"{point.value!r} is not of the form module:callable.")
         except ValueError as error:
             warnings.warn(f"The entry point {point.name!r} of the group {ENTRY_POINT_GROUP!r} is left out: {error}")
             continue
-        found[point.name] = EnvSpec(point.name, point.value)
-    return found
+        specs[point.name] = EnvSpec(point.name, point.value)
+    return specs
 
 
 def registered_ids() -> list[str]:
     """
-    :return: this package's own ids and those that users registered, in the order in which they are listed to users
+    Return the registered ids.
+
+    :return: The ids of this package's own environments and those that users registered, in the order in which they are listed
     """
     return list({**_SPECS, **_installed_specs()})
 
 
 def spec(id: str) -> EnvSpec:
     """
-    :param id: one of ``registered_ids()``, ``"family/name"`` or ``"module:callable"``
-    :return: its specification; nothing is imported for it
-    :raises ValueError: for an unknown id, naming the nearest ones and all there are
+    Return the specification of an environment, without importing its package.
+
+    :param id: One of ``registered_ids()``, ``"suite/name"`` or ``"module:callable"``
+    :return: The specification
+    :raises ValueError: For an unknown id. The message names the nearest ids and all that exist
     """
     id = str(id)
     if id in _SPECS:
@@ -217,45 +239,50 @@ def spec(id: str) -> EnvSpec:
     if _CALLABLE.fullmatch(id):
         return EnvSpec(id, id)
     prefix, slash, name = id.partition("/")
-    family = SUITES.get(prefix)
-    if family is not None and name:
-        return EnvSpec(id, family.make, batched=family.batched, family=family)
-    if family is not None:
-        names = family.known_names()
-        known = f": {listed(names)}" if names else ""
+    suite = SUITES.get(prefix)
+    if suite is not None and name:
+        return EnvSpec(id, suite.make, batched=suite.batched, suite=suite)
+    if suite is not None:
+        names = suite.known_names()
+        known = f": {comma_separated(names)}" if names else ""
         raise ValueError(f"{id!r} lacks the environment's name; its ids are {prefix + '/<name>'!r}{known}.")
     ids = registered_ids()
     patterns = [f"{name}/<name>" for name in SUITES]
+    # With a slash the misspelt part is probably the suite's name, without one the id as a whole
     hint = nearest(prefix + slash, [f"{name}/" for name in SUITES]) if slash else nearest(id, ids)
     raise ValueError(
-        f"Unknown environment id {id!r}.{hint} Registered ids: {', '.join(ids)}. Families: {', '.join(patterns)}."
+        f"Unknown environment id {id!r}.{hint} Registered ids: {', '.join(ids)}. Suites: {', '.join(patterns)}."
         " An environment of your own needs no id: pass a callable that returns a PettingZoo ParallelEnv, or 'module:callable'."
     )
 
 
 def make_parallel_env(id: str, **env_kwargs: Any) -> ParallelEnv:
     """
-    :param id: see ``spec``
-    :param env_kwargs: keyword arguments of the environment; they override those of the id
-    :return: one copy of the environment
-    :raises ValueError: for an unknown id
-    :raises ModuleNotFoundError: if its package is not installed, with the line that installs it
+    Make one copy of an environment.
+
+    :param id: See :func:`spec`
+    :param env_kwargs: Keyword arguments of the environment. They override those of the id
+    :return: The PettingZoo environment
+    :raises ValueError: For an unknown id
+    :raises ModuleNotFoundError: If its package is not installed. The message has the line that installs it
     """
     return spec(id).maker(**env_kwargs)()
 
 
 def make_batched_env(id: str, n_envs: int, **env_kwargs: Any) -> TeamVecEnv | None:
     """
-    :param id: see ``spec``
-    :param n_envs: number of copies
-    :param env_kwargs: keyword arguments of the environment; they override those of the id
-    :return: the copies stepped at once, or None if the environment has no batched class
-    :raises ValueError: for an unknown id
-    :raises ModuleNotFoundError: if its package is not installed, with the line that installs it
+    Make copies of an environment that are all stepped at once.
+
+    :param id: See :func:`spec`
+    :param n_envs: Number of environment copies
+    :param env_kwargs: Keyword arguments of the environment. They override those of the id
+    :return: The vectorised environment, or None if the environment has no batched class
+    :raises ValueError: For an unknown id
+    :raises ModuleNotFoundError: If its package is not installed. The message has the line that installs it
     """
-    found = spec(id)
-    if found.batched is None:
+    env_spec = spec(id)
+    if env_spec.batched is None:
         return None
-    if found.family is not None:
-        found.family.require(id)
-    return load(found.batched)(*found.leading, n_envs, **{**found.kwargs, **env_kwargs})
+    if env_spec.suite is not None:
+        env_spec.suite.require(id)
+    return load_attribute(env_spec.batched)(*env_spec.leading, n_envs, **{**env_spec.kwargs, **env_kwargs})

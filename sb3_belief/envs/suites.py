@@ -1,4 +1,4 @@
-"""The families of environments that come from other packages: ``family/name``."""
+"""Suites: environments of other packages, whose ids are ``suite/name``."""
 
 import difflib
 import sys
@@ -14,16 +14,19 @@ from typing import Any
 @dataclass(frozen=True)
 class Suite:
     """
-    How to make the environments of one package. It is data: nothing of the package is imported before one is made.
+    Description of how to make the environments of one package.
 
-    :param name: what stands before the slash of an id
-    :param make: ``"module:callable"``; ``callable(name, **env_kwargs)`` returns one copy, a PettingZoo ``ParallelEnv``
-    :param modules: modules that must be there
-    :param install: the line that installs them
-    :param batched: ``"module:callable"``; ``callable(name, n_envs, **env_kwargs)`` returns a ``TeamVecEnv`` that steps all
-        copies at once. None: there is none
-    :param names: ``"module:callable"``; ``callable()`` returns the names that the package knows. None: they cannot be listed
-    :param note: what else has to be known to install it, one sentence
+    A suite is plain data. Nothing of the package is imported before one of its environments is made.
+
+    :param name: Part of an id before the slash
+    :param make: ``"module:callable"``. ``callable(name, **env_kwargs)`` returns one copy, a PettingZoo ``ParallelEnv``
+    :param modules: Modules that must be installed
+    :param install: Command line that installs them
+    :param batched: ``"module:callable"``. ``callable(name, n_envs, **env_kwargs)`` returns a ``TeamVecEnv`` that steps all
+        copies at once. None if the suite has no such class
+    :param names: ``"module:callable"``. ``callable()`` returns the names of the package's environments. None if they cannot
+        be listed
+    :param note: One sentence about anything else that the installation needs
     """
 
     name: str
@@ -36,20 +39,26 @@ class Suite:
 
     def missing(self) -> list[str]:
         """
-        :return: the modules that are not installed; finding out imports none of them
+        Return the modules that are not installed, without importing any of them.
+
+        :return: Names of modules, in the order of ``modules``
         """
         return [module for module in self.modules if not is_installed(module)]
 
     def known_names(self) -> list[str]:
         """
-        :return: the names that the package knows, as far as it can be asked: it must be installed
+        Return the names of the package's environments.
+
+        :return: Names, or an empty list if the package is not installed or its environments cannot be listed
         """
-        return [] if self.names is None or self.missing() else list(load(self.names)())
+        return [] if self.names is None or self.missing() else list(load_attribute(self.names)())
 
     def require(self, id: str) -> None:
         """
-        :param id: of the environment that is asked for, for the message
-        :raises ModuleNotFoundError: if the package is not installed, with the line that installs it
+        Check that the package is installed.
+
+        :param id: Id of the environment that was asked for, for the message
+        :raises ModuleNotFoundError: If the package is not installed. The message has the line that installs it
         """
         missing = self.missing()
         if missing:
@@ -63,12 +72,12 @@ class Suite:
 _ADAPTERS = "sb3_belief.envs.adapters"
 
 
-def _family(name: str, modules: str, install: str, batched: bool = False, note: str = "") -> Suite:
+def _suite(name: str, module: str, install: str, batched: bool = False, note: str = "") -> Suite:
     adapter = f"{_ADAPTERS}.{name}"
     return Suite(
         name=name,
         make=f"{adapter}:make",
-        modules=(modules,),
+        modules=(module,),
         install=install,
         batched=f"{adapter}:make_batched" if batched else None,
         names=f"{adapter}:names",
@@ -76,47 +85,50 @@ def _family(name: str, modules: str, install: str, batched: bool = False, note: 
     )
 
 
-_STARCRAFT = "It needs StarCraft II itself too, and pysc2 needs protobuf<3.21."
+_STARCRAFT = "It also needs StarCraft II itself, and pysc2 needs protobuf<3.21."
 
 SUITES: Mapping[str, Suite] = MappingProxyType(
     {
-        family.name: family
-        for family in (
-            _family("mpe", "mpe2", "pip install mpe2"),
-            _family("pettingzoo", "pettingzoo", "pip install 'pettingzoo[all]'"),
-            _family("lbf", "lbforaging", "pip install lbforaging"),
-            _family("rware", "rware", "pip install rware"),
-            _family(
+        suite.name: suite
+        for suite in (
+            _suite("mpe", "mpe2", "pip install mpe2"),
+            _suite("pettingzoo", "pettingzoo", "pip install 'pettingzoo[all]'"),
+            _suite("lbf", "lbforaging", "pip install lbforaging"),
+            _suite("rware", "rware", "pip install rware"),
+            _suite(
                 "smaclite",
                 "smaclite",
-                # Its own requirements bring pygame beside pygame-ce, and an Rtree that needs libspatialindex on the system
+                # With its own requirements pip would install pygame, which conflicts with pygame-ce, and an old Rtree that
+                # needs libspatialindex from the system
                 "pip install --no-deps git+https://github.com/uoe-agents/smaclite.git && "
                 "pip install scikit-learn 'rtree>=1.1' pygame-ce",
             ),
-            _family(
+            _suite(
                 "smax",
                 "jaxmarl",
                 "pip install jaxmarl",
                 batched=True,
                 note="It needs gymnasium<1.4, so give it a virtual environment of its own.",
             ),
-            _family(
+            _suite(
                 "smac",
-                # The other project of this name has a module 'smac' too, but not this one
+                # Another project on PyPI has a module 'smac' too, but no module 'smac.env.starcraft2'
                 "smac.env.starcraft2",
                 "pip install git+https://github.com/oxwhirl/smac.git",
                 note=f"Not 'pip install smac', which installs another project (hyper-parameter optimisation). {_STARCRAFT}",
             ),
-            _family("smacv2", "smacv2", "pip install git+https://github.com/oxwhirl/smacv2.git", note=_STARCRAFT),
+            _suite("smacv2", "smacv2", "pip install git+https://github.com/oxwhirl/smacv2.git", note=_STARCRAFT),
         )
     }
 )
 
 
-def load(target: str) -> Any:
+def load_attribute(target: str) -> Any:
     """
+    Import a module and return one of its attributes.
+
     :param target: ``"module:attribute"``
-    :return: what it names
+    :return: The attribute
     """
     module, _, attribute = target.partition(":")
     return getattr(import_module(module), attribute)
@@ -124,54 +136,63 @@ def load(target: str) -> Any:
 
 def is_installed(module: str) -> bool:
     """
-    :param module: name of a module, with dots if it lies in a package
-    :return: whether it can be found; neither it nor its package is imported to find out
+    Return whether a module can be found, without importing it or a package that contains it.
+
+    :param module: Name of the module, with dots if it lies in a package
+    :return: Whether it is installed
     """
     if module in sys.modules:
         return sys.modules[module] is not None
+    # find_spec("a.b") would import the package a, so only the root is looked up this way and the rest in its folders
     root, *rest = module.split(".")
     try:
-        found = find_spec(root)
+        spec = find_spec(root)
     except ValueError:
-        # Something put into sys.modules by hand, without a specification
+        # The entry in sys.modules was made by hand and has no specification
         return False
     name = root
     for part in rest:
-        if found is None or found.submodule_search_locations is None:
+        if spec is None or spec.submodule_search_locations is None:
             return False
         name = f"{name}.{part}"
-        found = PathFinder.find_spec(name, list(found.submodule_search_locations))
-    return found is not None
+        spec = PathFinder.find_spec(name, list(spec.submodule_search_locations))
+    return spec is not None
 
 
 def nearest(given: object, names: Iterable[str], most: int = 3, cutoff: float = 0.4) -> str:
     """
-    :param given: what was typed
-    :param names: what could have been
-    :param most: how many names are suggested at most
-    :param cutoff: how alike they must be, in [0, 1]
-    :return: `` Did you mean 'x'?`` (with the leading space), or nothing if none is near
+    Return a suggestion for a misspelt name, to be appended to an error message.
+
+    :param given: What the user typed
+    :param names: The names that exist
+    :param most: Largest number of names to suggest
+    :param cutoff: How similar a name must be to be suggested, in [0, 1]
+    :return: `` Did you mean 'x'?`` with the leading space, or an empty string if no name is similar enough
     """
     near = difflib.get_close_matches(str(given), list(names), n=most, cutoff=cutoff)
     return f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 
-def unknown_name(family: str, name: str, names: Iterable[str]) -> ValueError:
+def unknown_name(suite: str, name: str, names: Iterable[str]) -> ValueError:
     """
-    :param family: name of the family
-    :param name: the name that it does not have
-    :param names: those that it has
-    :return: the error to raise, with the nearest names and all of them
+    Return the error for a name that a suite does not have.
+
+    :param suite: Name of the suite
+    :param name: The name that does not exist
+    :param names: The names that exist
+    :return: The error to raise, with the nearest names and all others
     """
     names = list(names)
-    return ValueError(f"The family {family!r} has no {name!r}.{nearest(name, names)} It has: {listed(names)}.")
+    return ValueError(f"The suite {suite!r} has no {name!r}.{nearest(name, names)} It has: {comma_separated(names)}.")
 
 
-def listed(names: Sequence[str], most: int = 40) -> str:
+def comma_separated(names: Sequence[str], most: int = 40) -> str:
     """
-    :param names: any number of names
-    :param most: how many of them are written out
-    :return: them for a message
+    Return names as one string, abbreviated if there are many.
+
+    :param names: The names
+    :param most: Largest number of names to write out
+    :return: The first ``most`` names with commas between them, and how many more there are
     """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

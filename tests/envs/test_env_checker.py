@@ -178,7 +178,7 @@ class Sight(ToyEnv):
         ({"agent_0": [True]}, "the entry for 'agent_0' at step 1 is [True] (1)"),
         ({"agent_0": [0.5, 1]}, "the entry for 'agent_0' at step 1 is [0.5, 1.0] (2)"),
         ({"agent_9": [True, True]}, "the entry for 'agent_9' at step 1"),
-        ({"agent_0": [True, True]}, "no entry for 'agent_1', who acted at step 1"),
+        ({"agent_0": [True, True]}, "no entry for 'agent_1', which acted at step 1"),
     ],
 )
 def test_visibility_that_cannot_be(told, message):

@@ -66,7 +66,7 @@ def test_unknown_id_names_the_nearest_and_all():
         make_parallel_env("zzz")
     with pytest.raises(ValueError, match="Unknown environment id"):
         make_batched_env("zzz", 2)
-    with pytest.raises(ValueError, match=r"Did you mean .*'smax/'.*Families: .*smax/<name>"):
+    with pytest.raises(ValueError, match=r"Did you mean .*'smax/'.*Suites: .*smax/<name>"):
         spec("smx/3m")
     with pytest.raises(ValueError, match=r"'mpe/' lacks the environment's name; its ids are 'mpe/<name>': .*simple_spread_v3"):
         spec("mpe/")
@@ -86,7 +86,7 @@ def test_importing_environments_loads_no_pygame_and_no_team():
         "import sys; import sb3_belief.envs.registry; before = 'sb3_belief.team' in sys.modules;"
         "sys.modules.pop('sb3_belief', None); print(before, 'pygame' in sys.modules, 'sb3_belief.zoo' in sys.modules)"
     )
-    # sb3_belief's own __init__ decides about the team room; what this room adds is what counts, so it is imported bare
+    # sb3_belief's own __init__ imports the team package. What counts here is what envs imports, so it is imported without it
     bare = (
         "import sys, types, pathlib; package = types.ModuleType('sb3_belief');"
         "package.__path__ = [str(pathlib.Path('sb3_belief').resolve())]; sys.modules['sb3_belief'] = package;"
@@ -102,26 +102,26 @@ def own_registry(monkeypatch):
 
 
 def test_looking_at_the_registry_imports_no_package():
-    roots = sorted({module.partition(".")[0] for family in SUITES.values() for module in family.modules} - {"pettingzoo"})
+    roots = sorted({module.partition(".")[0] for suite in SUITES.values() for module in suite.modules} - {"pettingzoo"})
     code = (
         "import sys; from sb3_belief.envs import registry\n"
-        "for family in registry.FAMILIES.values(): registry.spec(f'{family.name}/x'); family.missing()\n"
+        "for suite in registry.SUITES.values(): registry.spec(f'{suite.name}/x'); suite.missing()\n"
         f"print([name for name in {roots} if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("family", SUITES.values(), ids=lambda family: family.name)
-def test_a_missing_package_is_named_with_the_line_that_installs_it(family, monkeypatch):
+@pytest.mark.parametrize("suite", SUITES.values(), ids=lambda suite: suite.name)
+def test_a_missing_package_is_named_with_the_line_that_installs_it(suite, monkeypatch):
     monkeypatch.setattr(suites, "is_installed", lambda module: False)
     makers: list[Any] = [make_parallel_env, make_team_env]
-    if family.batched is not None:
+    if suite.batched is not None:
         makers.append(lambda id: make_batched_env(id, 2))
     for make in makers:
-        with pytest.raises(ModuleNotFoundError, match=re.escape(family.install)) as error:
-            make(f"{family.name}/3m")
-        assert error.value.name == family.modules[0] and family.note in str(error.value)
+        with pytest.raises(ModuleNotFoundError, match=re.escape(suite.install)) as error:
+            make(f"{suite.name}/3m")
+        assert error.value.name == suite.modules[0] and suite.note in str(error.value)
 
 
 def test_the_missing_smac_warns_of_the_other_project(monkeypatch):
@@ -194,8 +194,8 @@ def test_what_a_user_registered_makes_a_team(own_registry, vec_env):
 @pytest.mark.parametrize(
     ("id", "message"),
     [
-        ("smax/mine", "is of the family 'smax'"),
-        ("mpe", "is of the family 'mpe'"),
+        ("smax/mine", "belongs to the suite 'smax'"),
+        ("mpe", "belongs to the suite 'mpe'"),
         ("", "cannot be an id"),
         ("a:b", "cannot be an id"),
         ("../a", "cannot be an id"),

@@ -96,7 +96,7 @@ def test_the_followers_history_pairs_cues_with_what_the_leader_did_at_them(env_n
     for _ in range(20):
         played = [int(convention[cue]) for convention, cue in zip(env.get_attr("convention"), obs, strict=True)]
         actions = {"follower": generator.integers(3, size=2)}
-        (part,) = scheduler._views.split(actions, env.step(actions))
+        (part,) = scheduler._splitter.split(actions, env.step(actions))
         for i in range(2):
             expected = np.eye(3)[played[i]] if leader_visible else np.zeros(3)
             assert part[3][i]["others_actions"].tolist() == expected.tolist()

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_belief.envs.base import UnitsGame, check_render_mode, require_render_mode
+from sb3_belief.envs.base import BattleGame, check_render_mode, require_render_mode
 
 RENDER_MODES = ("human", "rgb_array")
 NO_OP = 0
@@ -15,7 +15,7 @@ NO_OP = 0
 ATTEMPTS = 3
 
 
-class StarCraft(UnitsGame[np.ndarray]):
+class StarCraft(BattleGame[np.ndarray]):
     """
     A team of units in StarCraft II against its built-in opponent, through the interface that SMAC and SMACv2 have in common.
 
@@ -199,7 +199,7 @@ class StarCraft(UnitsGame[np.ndarray]):
         return dict(zip(self.possible_agents, rows, strict=True))
 
     def _action_of(self, i: int, agent: str, actions: dict[str, int]) -> int:
-        action = self._chosen(agent, actions)
+        action = self._checked_action(agent, actions)
         if self._masks[i, NO_OP]:
             return NO_OP
         if not self._masks[i, action]:

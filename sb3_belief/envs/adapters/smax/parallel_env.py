@@ -8,12 +8,12 @@ from gymnasium import spaces
 from sb3_belief.envs.adapters.smax.core import Battles
 from sb3_belief.envs.adapters.smax.program import BattleConfig
 from sb3_belief.envs.adapters.smax.rendering import draw
-from sb3_belief.envs.base import UnitsGame, check_render_mode, require_render_mode
+from sb3_belief.envs.base import BattleGame, check_render_mode, require_render_mode
 
 RENDER_MODES = ("rgb_array",)
 
 
-class Smax(UnitsGame[np.ndarray]):
+class Smax(BattleGame[np.ndarray]):
     """
     One battle of allies, the agents, against SMAX's scripted enemies.
 
@@ -81,7 +81,7 @@ class Smax(UnitsGame[np.ndarray]):
         :raises ValueError: if an agent's action is missing or outside its space, or if no episode is under way
         """
         self._require_episode()
-        result = self.battles.step(np.array([[self._chosen(agent, actions) for agent in self.possible_agents]]))
+        result = self.battles.step(np.array([[self._checked_action(agent, actions) for agent in self.possible_agents]]))
         self._visible = result.visible[0]
         ended, cut = bool(result.ended[0]), bool(result.cut[0])
         masks = self.battles.masks[:, 0]
