@@ -150,7 +150,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
         # Whoever acts asks for no prediction
         output = self.infer(flat, noise, kept, predict=th.is_grad_enabled())
         self.passing.output, self.passing.noise = output, noise
-        return self.beside(self.features(observations), output)
+        return self.with_belief(self.features(observations), output)
 
     def draw_noise(self, flat: th.Tensor) -> th.Tensor | None:
         """
@@ -159,7 +159,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
         """
         return th.randn(len(flat), self.belief.latent_dim, device=flat.device) if self.belief.variant.samples else None
 
-    def beside(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures:
+    def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures:
         """
         :param own: Features of the observation
         :param output: The belief about it

@@ -1,43 +1,60 @@
-"""The models of a team with what goes with each of them: how they are made, loaded and moved to another environment."""
+"""The models of a team with what belongs to each of them: how they are built, loaded and moved to another environment."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.team.arguments import as_callback
 from sb3_belief.team.checkpoint import SavedTeam
 from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief.team.lockstep.scheduler import AgentTask
 from sb3_belief.team.predictor import Predictor
 
-# Class, policy and further arguments of an agent's model
-AgentSpec = tuple[type[BaseAlgorithm], str | type[BasePolicy], dict[str, Any]]
+
+class AgentSpec(NamedTuple):
+    """
+    What an agent's model is built from.
+
+    :param algo_class: Class of the algorithm
+    :param policy: Its policy, a name or a class
+    :param kwargs: Further arguments of the algorithm
+    """
+
+    algo_class: type[BaseAlgorithm]
+    policy: str | type[BasePolicy]
+    kwargs: dict[str, Any]
 
 
 def agent_seed(seed: int, index: int) -> int:
     """
-    The seed of an agent's model: that of its weights, its actions and its minibatches.
+    Return the seed of an agent's model: of its weights, its actions and its minibatches.
 
-    :param seed: the team's
-    :param index: the agent's place in ``possible_agents``
-    :return: its own, in [0, 2**32): different for each agent, and the same whatever the other agents are
+    :param seed: The team's seed
+    :param index: The agent's place in ``possible_agents``
+    :return: Its own seed, in [0, 2**32): different for each agent, and the same whatever the other agents are
     """
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0])
 
 
 def team_rng(seed: int | None) -> RngState:
     """
-    :param seed: the team's
-    :return: what the environment in this process and the team's callbacks draw from while the team learns
+    Return the random number generators of the environment in this process and of the team's callbacks.
+
+    :param seed: The team's seed, or None
     """
     return RngState(None if seed is None else int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
@@ -45,82 +62,89 @@ def team_rng(seed: int | None) -> RngState:
 @dataclass
 class AgentModels:
     """
-    All of it by agent, in the order of ``possible_agents``.
+    What a team holds of its agents, each dict in the order of ``possible_agents``.
 
-    :param models: the models
-    :param statistics: the normalisation of those that have one
-    :param streams: what each draws from
+    :param models: The models
+    :param statistics: The normalisation of the agents that have one
+    :param rngs: The random number generators
     """
 
     models: dict[str, BaseAlgorithm] = field(default_factory=dict)
     statistics: dict[str, VecNormalize] = field(default_factory=dict)
-    streams: dict[str, RngState] = field(default_factory=dict)
+    rngs: dict[str, RngState] = field(default_factory=dict)
 
     @staticmethod
     def build(
         specs: Mapping[str, AgentSpec],
-        scheduler: JointLoop,
+        loop: JointLoop,
         seed: int | None,
         normalize: bool | Mapping[str, Any],
         verbose: int,
         device: th.device | str,
     ) -> "AgentModels":
         """
-        :param recipes: {agent: what its model is made of}
-        :param hub: has the agents' environments
-        :param seed: the team's
-        :param normalize: True or arguments of ``VecNormalize``: normalise; False: not
-        :param verbose: of the models
-        :param device: of the models
-        :return: new models
-        :raises TypeError: if a class is not an SB3 algorithm
+        Build new models.
+
+        :param specs: What each agent's model is built from
+        :param loop: Has the agents' environments
+        :param seed: The team's seed
+        :param normalize: True or arguments of ``VecNormalize`` to normalise, False not to
+        :param verbose: Of the models
+        :param device: Of the models
+        :return: The models
+        :raises TypeError: If a class is not an SB3 algorithm
         """
-        models = AgentModels()
-        for k, (agent, (algo_class, policy, kwargs)) in enumerate(specs.items()):
+        agents = AgentModels()
+        for k, (agent, spec) in enumerate(specs.items()):
+            algo_class = spec.algo_class
             if not (isinstance(algo_class, type) and issubclass(algo_class, BaseAlgorithm)):
                 raise TypeError(f"The algorithm of {agent!r} must be a class of SB3 or derived from one, got {algo_class!r}.")
             own_seed = None if seed is None else agent_seed(seed, k)
             # A copy, so that nothing is shared: SB3 writes into policy_kwargs, and action noise has a state
-            arguments: dict[str, Any] = {"seed": own_seed, "device": device, "verbose": verbose, **deepcopy(kwargs)}
-            env: VecEnv = scheduler.agent_envs[agent]
+            arguments: dict[str, Any] = {"seed": own_seed, "device": device, "verbose": verbose, **deepcopy(spec.kwargs)}
+            env: VecEnv = loop.agent_envs[agent]
             if normalize is not False:
-                env = models.statistics[agent] = normalized(env, normalize, arguments.get("gamma"))
-            models.streams[agent] = RngState(own_seed)
-            with RngSwitch(models.streams[agent]):
+                env = agents.statistics[agent] = normalized(env, normalize, arguments.get("gamma"))
+            agents.rngs[agent] = RngState(own_seed)
+            with RngSwitch(agents.rngs[agent]):
                 try:
-                    models.models[agent] = algo_class(policy, env, **arguments)
+                    agents.models[agent] = algo_class(spec.policy, env, **arguments)
                 except Exception as error:
                     add_note(error, f"Raised while the model of agent {agent!r} was made ({algo_class.__name__}).")
                     raise
-        return models
+        return agents
 
     @staticmethod
-    def load(saved: SavedTeam, scheduler: JointLoop | None, seed: int | None, device: th.device | str) -> "AgentModels":
+    def load(saved: SavedTeam, loop: JointLoop | None, seed: int | None, device: th.device | str) -> "AgentModels":
         """
-        :param saved: a file's contents
-        :param hub: has the agents' environments; None: the models can only predict
-        :param seed: the team's; the random streams start anew from it
-        :param device: of the models
-        :return: the saved models
+        Load saved models. Their random number generators start anew from the seed.
+
+        :param saved: The contents of a file
+        :param loop: Has the agents' environments; None for models that only predict
+        :param seed: The team's seed
+        :param device: Of the models
+        :return: The models
         """
-        models = AgentModels(statistics=saved.statistics)
+        agents = AgentModels(statistics=saved.statistics)
         for k, agent in enumerate(saved.manifest["agents"]):
-            env: VecEnv | None = None if scheduler is None else scheduler.agent_envs[agent]
+            env: VecEnv | None = None if loop is None else loop.agent_envs[agent]
             if env is not None and agent in saved.statistics:
                 saved.statistics[agent].set_venv(env)
                 env = saved.statistics[agent]
-            models.streams[agent] = RngState(None if seed is None else agent_seed(seed, k))
-            with RngSwitch(models.streams[agent]):
+            agents.rngs[agent] = RngState(None if seed is None else agent_seed(seed, k))
+            with RngSwitch(agents.rngs[agent]):
                 file = io.BytesIO(saved.models[agent])
-                models.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
-        return models
+                agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
+        return agents
 
-    def move(self, scheduler: JointLoop) -> None:
+    def move(self, loop: JointLoop) -> None:
         """
-        :param hub: has the agents' environments from now on
+        Give all models another environment.
+
+        :param loop: Has the agents' environments from now on
         """
         for agent, model in self.models.items():
-            env: VecEnv = scheduler.agent_envs[agent]
+            env: VecEnv = loop.agent_envs[agent]
             if agent in self.statistics:
                 # set_venv() is meant for loaded statistics and refuses to replace an environment
                 self.statistics[agent].venv = None  # type: ignore[assignment]
@@ -128,22 +152,64 @@ class AgentModels:
                 env = self.statistics[agent]
             model.set_env(env)
 
-    def actor(self, agent: str) -> Predictor:
+    def tasks(self, learn: Callable[..., None], callbacks: Mapping[str, MaybeCallback]) -> dict[str, AgentTask]:
         """
-        :param agent: name of the agent
-        :return: predicts with its model, on observations as the team's environment gives them
+        Return the tasks that a scheduler runs.
+
+        :param learn: Runs a model's ``learn()``, called with the model and a callback
+        :param callbacks: Callbacks of single agents
+        :return: One task for each agent
+        """
+        return {
+            agent: AgentTask(
+                learn=partial(learn, model),
+                act=self.predictor(agent).act,
+                rng=self.rngs[agent],
+                callback=as_callback(callbacks[agent]) if callbacks.get(agent) is not None else None,
+            )
+            for agent, model in self.models.items()
+        }
+
+    def predictor(self, agent: str) -> Predictor:
+        """
+        Return a predictor of the agent's model.
+
+        :param agent: Name of the agent
         """
         return Predictor(self.models[agent], self.statistics.get(agent))
 
 
+def run_learn(
+    model: BaseAlgorithm, callback: BaseCallback, total_timesteps: int, log_interval: int | None, reset_num_timesteps: bool
+) -> None:
+    """
+    Run a model's own ``learn``, in this process or in a worker.
+
+    :param model: Of an agent
+    :param callback: Waits for the other agents
+    :param total_timesteps: As in ``Team.learn``
+    :param log_interval: As in ``Team.learn``
+    :param reset_num_timesteps: As in ``Team.learn``
+    """
+    model.learn(
+        total_timesteps,
+        callback=callback,
+        # SB3's loops take None for "never", although their signatures do not say so
+        log_interval=log_interval,  # type: ignore[arg-type]
+        reset_num_timesteps=reset_num_timesteps,
+    )
+
+
 def normalized(env: VecEnv, normalize: bool | Mapping[str, Any], gamma: float | None) -> VecNormalize:
     """
-    :param env: an agent's environment
+    Wrap an agent's environment in a ``VecNormalize`` with statistics of its own.
+
+    :param env: The agent's environment
     :param normalize: True, or arguments of ``VecNormalize``
-    :param gamma: discount of the agent's algorithm, used for the returns unless ``normalize`` has one
-    :return: the environment with statistics of its own; observations that are not a ``Box`` stay as they are
+    :param gamma: Discount of the agent's algorithm, used for the returns unless ``normalize`` has one
+    :return: The wrapped environment; observations that are not a ``Box`` stay as they are
     """
-    arguments = {} if normalize is True else dict(normalize)  # type: ignore[arg-type]
+    arguments = dict(normalize) if isinstance(normalize, Mapping) else {}
     if gamma is not None:
         arguments.setdefault("gamma", gamma)
     if not isinstance(env.observation_space, spaces.Box):

@@ -1,20 +1,24 @@
-"""Checks of what a user gives a ``Team``."""
+"""Checks and conversions of what a user gives a ``Team``."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pettingzoo import ParallelEnv
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
 
-def check_env(env: Any) -> VecEnv:
+def check_team_vec_env(env: Any) -> VecEnv:
     """
-    :param env: what was given as the environment of a team
-    :return: the same
-    :raises TypeError: if it is not a ``TeamVecEnv`` or SB3 wrappers around one
-    :raises ValueError: if it is normalised as a whole
+    Check the environment of a team.
+
+    :param env: What the user gave
+    :return: The same
+    :raises TypeError: If it is not a ``TeamVecEnv`` or SB3 wrappers around one
+    :raises ValueError: If it is normalised as a whole
     """
     if isinstance(env, VecEnv) and isinstance(env.unwrapped, TeamVecEnv):
         if unwrap_vec_normalize(env) is not None:
@@ -33,28 +37,47 @@ def check_env(env: Any) -> VecEnv:
 
 def per_agent(name: str, given: Any, agents: Sequence[str]) -> dict[str, Any]:
     """
-    :param name: of the argument, for messages
-    :param given: one value for all, or {agent: value}
-    :param agents: names of the agents
-    :return: {agent: value}
-    :raises ValueError: if agents are unknown or missing
+    Give each agent its value of an argument.
+
+    :param name: Name of the argument, for messages
+    :param given: One value for all agents, or a dict of one for each
+    :param agents: Names of the agents
+    :return: The value of each agent
+    :raises ValueError: If agents are unknown or missing
     """
     if not isinstance(given, Mapping):
         return {agent: given for agent in agents}
-    check_names(name, given, agents)
+    check_agent_keys(name, given, agents)
     missing = [agent for agent in agents if agent not in given]
     if missing:
         raise ValueError(f"{name} has no entry for {missing}; it needs one for each of {list(agents)}, or one value for all.")
     return {agent: given[agent] for agent in agents}
 
 
-def check_names(name: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
+def check_agent_keys(name: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:
     """
-    :param name: of the argument, for messages
-    :param given: {agent: value}
-    :param agents: names of the agents
-    :raises ValueError: if agents are unknown
+    Check that a dict by agent has no unknown agents.
+
+    :param name: Name of the argument, for messages
+    :param given: The dict
+    :param agents: Names of the agents
+    :raises ValueError: If agents are unknown
     """
     unknown = [agent for agent in given if agent not in agents]
     if unknown:
         raise ValueError(f"{name} has entries for unknown agents {unknown}; the agents are {list(agents)}.")
+
+
+def as_callback(callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+    """
+    Convert what SB3's ``learn`` takes as a callback into one callback.
+
+    :param callback: None, a function, a callback or a list of them
+    :param progress_bar: Whether to add SB3's progress bar
+    :return: One callback
+    """
+    if isinstance(callback, list):
+        callback = CallbackList(callback)
+    if not isinstance(callback, BaseCallback):
+        callback = ConvertCallback(callback)
+    return CallbackList([callback, ProgressBarCallback()]) if progress_bar else callback

@@ -13,10 +13,10 @@ PolicyState = tuple[np.ndarray, ...] | None
 
 class Predictor:
     """
-    Predicts with a model on observations as they come from the team's environment.
+    Predicts with a model from observations as the team's environment returns them, before normalisation.
 
-    :param model: of the agent
-    :param statistics: its normalisation, if it has one; it is used as it is, never updated
+    :param model: Of the agent
+    :param statistics: Its normalisation, if it has one; it is used as it is and never updated
     """
 
     def __init__(self, model: BaseAlgorithm, statistics: VecNormalize | None):
@@ -34,26 +34,28 @@ class Predictor:
         masks: np.ndarray | None = None,
     ) -> tuple[np.ndarray, PolicyState]:
         """
-        :param obs: one observation or a batch of them, not normalised
-        :param state: recurrent state, None at first
-        :param episode_start: bool [n_envs]: where the recurrent state starts anew
-        :param deterministic: the most likely action instead of a sample
-        :param masks: bool [n_envs, k] or [k]: possible actions; for models whose ``predict`` takes them
-        :return: action(s) and the next recurrent state
+        Predict as SB3's ``predict`` does.
+
+        :param obs: One observation or a batch of them, not normalised
+        :param state: Recurrent state, None at first
+        :param episode_start: Where the recurrent state starts anew, bool ``[n_envs]``
+        :param deterministic: Whether to take the most likely action instead of a sample
+        :param masks: Possible actions, bool ``[n_envs, k]`` or ``[k]``; for models whose ``predict`` takes them
+        :return: Action(s) and the next recurrent state
         """
         if self._statistics is not None:
             obs = self._statistics.normalize_obs(obs)  # type: ignore[assignment]
         kwargs: dict[str, Any] = {} if masks is None or not self.takes_masks else {"action_masks": masks}
         return self._model.predict(obs, state, episode_start, deterministic, **kwargs)
 
-    def go_on(self, obs: np.ndarray, episode_start: np.ndarray, masks: np.ndarray | None) -> np.ndarray:
+    def act(self, obs: np.ndarray, episode_start: np.ndarray, masks: np.ndarray | None) -> np.ndarray:
         """
-        Act as in training, for an agent that has finished learning while others have not.
+        Sample actions as in training, keeping the recurrent state, for an agent that has finished learning before others.
 
-        :param obs: array [num_envs, ...]
-        :param episode_start: bool [num_envs]
-        :param masks: bool [num_envs, k] or None
-        :return: sampled actions [num_envs, ...]
+        :param obs: ``[num_envs, ...]``
+        :param episode_start: bool ``[num_envs]``
+        :param masks: bool ``[num_envs, k]``, or None
+        :return: ``[num_envs, ...]``
         """
         actions, self._state = self.predict(obs, self._state, episode_start, masks=masks)
         return actions

@@ -13,7 +13,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -21,14 +20,12 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_belief.common.rng import RngSwitch
-from sb3_belief.team.agent_models import AgentModels, team_rng
-from sb3_belief.team.arguments import check_env, check_names, per_agent
+from sb3_belief.team.agent_models import AgentModels, AgentSpec, run_learn, team_rng
+from sb3_belief.team.arguments import as_callback, check_agent_keys, check_team_vec_env, per_agent
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
-from sb3_belief.team.lockstep.agent_task import AgentTask
-from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.team.lockstep.progress import TeamProgress, as_callback
+from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog
-from sb3_belief.team.parallel import Jobs, check_jobs
+from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
@@ -39,35 +36,37 @@ class Team:
     """
     One SB3 model for each agent of a team, all learning at once in one vectorised environment.
 
-    The models are unmodified SB3 ones and share nothing: weights, buffers, normalisation, loggers and random streams are
-    each agent's own. With ``seed=s`` the environment is seeded with ``s`` as SB3 models do it, and agent k's model with
+    The models are unmodified SB3 ones and share nothing: weights, buffers, normalisation, loggers and random number generators
+    are each agent's own. With ``seed=s`` the environment is seeded with ``s`` as SB3 models do it, and agent k's model with
     ``agent_seed(s, k)``, so that equal networks start differently and no agent's learning depends on how many random numbers
-    another draws. Policies of equal shape act together, in one pass with their weights stacked, to the same bits. One timestep
-    is one joint step of one copy of the environment.
+    another draws. Policies of equal shape make their forward passes in one batch, with the same result to the bit. One
+    timestep is one joint step of one copy of the environment.
 
     ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps`` and ``logger`` are those of an SB3
-    model, so that ``evaluate_policy`` and SB3's callbacks take a team as it is.
+    model, so ``evaluate_policy`` and SB3's callbacks take a team as it is.
 
-    :param algo_class: class of SB3, sb3-contrib or this package for all agents, or {agent: class}
-    :param policy: policy of that class for all agents, or {agent: policy}
-    :param env: a ``TeamVecEnv`` (see ``make_team_env``) or SB3 wrappers around one
-    :param seed: of the environment and all models; None: not seeded
-    :param normalize: True or arguments of ``VecNormalize``: each agent's observations and rewards are normalised by running
-        statistics of its own (an inactive agent's zero observations count too); False: not
-    :param verbose: 1: one table per iteration; 2: also what the models themselves print
-    :param log_dir: folder of CSV logs: ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None: none
-    :param tensorboard_log: folder of TensorBoard logs: ``Team_<k>`` and ``Team_<k>/agents/<agent>``; None: none
-    :param device: of all models
-    :param jobs: how many processes share the agents whose algorithms are on-policy (PPO, A2C, ...), this one among them. Each
-        agent learns in one of them, or is only updated there if it has a callback of its own, if the team has one that is not
-        SB3's or sb3-contrib's, or if methods of its model were replaced: then somebody looks at it meanwhile. With any number
-        the same is learned, drawn and logged, bit for bit. For models on the CPU, in a script that can be imported
-        (``if __name__ == "__main__":``); with ``torch.set_num_threads(1)`` each takes one core. An algorithm of one's own may
-        read and change all of its model; what else it leaves in memory stays in its process
-    :param agent_kwargs: {agent: {argument: value}} for single agents, overriding ``kwargs``
-    :param kwargs: further arguments of the algorithm class for all agents
-    :raises TypeError: if ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
-    :raises ValueError: for unknown or missing agents, or if ``jobs`` is not a number of processes, or a model cannot use them
+    :param algo_class: Class of SB3, sb3-contrib or this package for all agents, or a dict of one for each agent
+    :param policy: Policy of that class for all agents, or a dict of one for each agent
+    :param env: A ``TeamVecEnv`` (see ``make_team_env``) or SB3 wrappers around one
+    :param seed: Seed of the environment and all models; None to leave them unseeded
+    :param normalize: True or arguments of ``VecNormalize`` to normalise each agent's observations and rewards by running
+        statistics of its own (an inactive agent's zero observations count too); False not to
+    :param verbose: 1 prints one table per iteration, 2 also what the models themselves print
+    :param log_dir: Folder of the CSV logs ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV
+        logs
+    :param tensorboard_log: Folder of the TensorBoard logs ``Team_<k>`` and ``Team_<k>/agents/<agent>``; None for none
+    :param device: Device of all models
+    :param jobs: Number of processes, the main one included, among which the agents with on-policy algorithms (PPO, A2C, ...)
+        are divided; each agent learns wholly in one of them. What is learned, drawn and logged is the same for any number, bit
+        for bit. An agent whose model may be looked at meanwhile (it has a callback of its own, or some of its methods were
+        replaced) learns in the main process, and so do all agents, with a warning, if the team has a callback that is not from
+        SB3 or sb3-contrib. For models on the CPU, in a script that can be imported (``if __name__ == "__main__":``); with
+        ``torch.set_num_threads(1)`` each process takes one core
+    :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
+    :param kwargs: Further arguments of the algorithm class for all agents
+    :raises TypeError: If ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
+    :raises ValueError: If agents are unknown or missing, if ``jobs`` is not a number of processes, or if a model cannot learn
+        in another process
     """
 
     def __init__(
@@ -86,21 +85,21 @@ class Team:
         **kwargs: Any,
     ):
         check_jobs(jobs)
-        scheduler = JointLoop(check_env(env))
-        agents = scheduler.possible_agents
-        classes, policies = per_agent("algo_class", algo_class, agents), per_agent("policy", policy, agents)
+        loop = JointLoop(check_team_vec_env(env))
+        names = loop.possible_agents
+        classes, policies = per_agent("algo_class", algo_class, names), per_agent("policy", policy, names)
         own_kwargs = agent_kwargs or {}
-        check_names("agent_kwargs", own_kwargs, agents)
-        specs = {agent: (classes[agent], policies[agent], {**kwargs, **own_kwargs.get(agent, {})}) for agent in agents}
-        models = AgentModels.build(specs, scheduler, seed, normalize, max(verbose - 1, 0), device)
-        self._setup(scheduler, models, scheduler.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
+        check_agent_keys("agent_kwargs", own_kwargs, names)
+        specs = {name: AgentSpec(classes[name], policies[name], {**kwargs, **own_kwargs.get(name, {})}) for name in names}
+        agents = AgentModels.build(specs, loop, seed, normalize, max(verbose - 1, 0), device)
+        self._setup(loop, agents, loop.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
         if seed is not None:
             env.seed(seed)
 
     def _setup(
         self,
-        scheduler: JointLoop | None,
-        models: AgentModels,
+        loop: JointLoop | None,
+        agents: AgentModels,
         scripted: dict[str, str],
         seed: int | None,
         normalize: bool | dict[str, Any],
@@ -109,10 +108,10 @@ class Team:
         tensorboard_log: str | None,
         jobs: int,
     ) -> None:
-        self._scheduler = scheduler
-        self._models = models
+        self._loop = loop
+        self._agents = agents
         self._scripted = scripted
-        self.possible_agents = list(models.models)
+        self.possible_agents = list(agents.models)
         self.seed = seed
         self.normalize = normalize
         self.verbose = verbose
@@ -122,50 +121,48 @@ class Team:
         self._log_dir, self._tensorboard_log = log_dir, tensorboard_log
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
-        self._stream = team_rng(seed)
-        self._jobs = Jobs(models.models, models.streams, jobs)
+        self._rng = team_rng(seed)
+        self._parallel = ParallelLearning(agents.models, agents.rngs, jobs)
         self._learning = False
-        # False when the agents' last observations are not all those of where the environment is now
+        # Whether all agents' last observations are those of the environment's present state
         self._can_continue = False
         self._start_time, self._start_timesteps, self._iterations = 0, 0, 0
 
     @property
     def agents(self) -> dict[str, BaseAlgorithm]:
         """
-        :return: {agent: its model}. While the team learns with several ``jobs``, models in other processes are up to date for
-            who asks here, not for who has kept them
+        The models by agent.
+
+        While the team learns with several ``jobs``, asking for them brings those in other processes up to date. A reference
+        that was kept from before is not updated.
         """
-        self._jobs.look()
-        return self._models.models
+        self._parallel.sync_models()
+        return self._agents.models
 
     @property
     def observation_space(self) -> spaces.Dict:
-        """
-        :return: the agents' observation spaces by agent
-        """
-        if self._scheduler is not None:
-            return spaces.Dict(self._scheduler.observation_spaces)
-        return spaces.Dict({agent: model.observation_space for agent, model in self._models.models.items()})
+        """The agents' observation spaces by agent."""
+        if self._loop is not None:
+            return spaces.Dict(self._loop.observation_spaces)
+        return spaces.Dict({agent: model.observation_space for agent, model in self._agents.models.items()})
 
     @property
     def action_space(self) -> spaces.Dict:
-        """
-        :return: the agents' action spaces by agent
-        """
-        return spaces.Dict({agent: model.action_space for agent, model in self._models.models.items()})
+        """The agents' action spaces by agent."""
+        return spaces.Dict({agent: model.action_space for agent, model in self._agents.models.items()})
 
     @property
     def logger(self) -> Logger:
-        """
-        :return: the team's logger, there from the first ``learn`` on
-        """
+        """The team's logger, available from the first ``learn`` on."""
         if self._logger is None:
             raise AttributeError("A Team has a logger from its first learn() on, or from set_logger().")
         return self._logger
 
     def set_logger(self, logger: Logger) -> None:
         """
-        :param logger: for the team's table, instead of the one that ``verbose``, ``log_dir`` and ``tensorboard_log`` ask for
+        Replace the logger of the team's table, which ``verbose``, ``log_dir`` and ``tensorboard_log`` set up by default.
+
+        :param logger: The new logger
         """
         self._logger = logger
 
@@ -181,28 +178,29 @@ class Team:
         """
         Let all agents learn at once.
 
-        Each model's own ``learn`` runs, unmodified, with these arguments. Whoever's callback returns False, all end after that
-        step. An agent that reaches ``total_timesteps`` earlier than others (because of its rollout length) goes on acting
-        without learning.
+        Each model's own ``learn`` runs, unmodified, with these arguments. If any callback returns False, all agents stop after
+        that step. An agent that reaches ``total_timesteps`` earlier than others (because of its rollout length) continues to
+        act without learning.
 
-        :param total_timesteps: at least so many joint steps (over all copies of the environment)
-        :param callback: called once per joint step with the team as its model
-        :param log_interval: as each agent's algorithm takes it: iterations of on-policy ones, episodes of off-policy ones
-        :param reset_num_timesteps: start counting, and new episodes; False: go on where the last ``learn`` ended (with new
-            episodes only if it ended out of step: by a callback, an error, or with some agents finished before others)
-        :param progress_bar: show SB3's progress bar
-        :param agent_callbacks: {agent: callback} with the agent's model as its model
-        :return: the team
-        :raises RuntimeError: if the team is learning already
-        :raises ValueError: if it has no environment, or for unknown agents
+        :param total_timesteps: Least number of joint steps, over all copies of the environment
+        :param callback: Called once per joint step with the team as its model
+        :param log_interval: As each agent's algorithm takes it: iterations of on-policy ones, episodes of off-policy ones
+        :param reset_num_timesteps: True starts counting, and new episodes; False continues where the last ``learn`` ended
+            (with new episodes only if it ended out of step: by a callback, an error, or with some agents finished before
+            others)
+        :param progress_bar: Whether to show SB3's progress bar
+        :param agent_callbacks: Callbacks of single agents by agent, each with the agent's model as its model
+        :return: The team
+        :raises RuntimeError: If the team is learning already
+        :raises ValueError: If it has no environment, or if agents are unknown
         """
         if self._learning:
             raise RuntimeError("This team is learning already: learn() cannot be called by a callback or an agent of its own.")
-        scheduler = self._scheduler
-        if scheduler is None:
+        loop = self._loop
+        if loop is None:
             raise ValueError("This team has no environment to learn in: use set_env(), or Team.load(path, env=env).")
         own_callbacks = agent_callbacks or {}
-        check_names("agent_callbacks", own_callbacks, self.possible_agents)
+        check_agent_keys("agent_callbacks", own_callbacks, self.possible_agents)
         self._learning = True
         try:
             if reset_num_timesteps:
@@ -213,36 +211,26 @@ class Team:
             self._start_time, self._start_timesteps = time.time_ns(), self.num_timesteps
             log = self._make_log()
             learn = partial(
-                _learn,
+                run_learn,
                 total_timesteps=total_timesteps,
                 log_interval=log_interval,
                 reset_num_timesteps=reset_num_timesteps,
             )
-            tasks = {
-                agent: AgentTask(
-                    learn=partial(learn, model),
-                    act=self._models.actor(agent).go_on,
-                    stream=self._models.streams[agent],
-                    callback=as_callback(own_callbacks[agent]) if own_callbacks.get(agent) is not None else None,
-                )
-                for agent, model in self.agents.items()
-            }
+            tasks = self._agents.tasks(learn, own_callbacks)
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
             team_callback = as_callback(callback, progress_bar)
             progress = TeamProgress(self, team_callback, log)
-            with RngSwitch(self._stream):
+            with RngSwitch(self._rng):
                 if fresh:
                     for model in self.agents.values():
                         model._last_obs = None
-                    scheduler.reset()
+                    loop.reset()
                 total = total_timesteps + self.num_timesteps
-                progress.on_training_start(
-                    {"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": scheduler.env}
-                )
-            with self._jobs.shared_out(scheduler, tasks, learn, team_callback) as remote_groups:
-                in_step = scheduler.run(tasks, progress, self._stream, remote_groups)
-            with RngSwitch(self._stream):
+                progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": loop.env})
+            with self._parallel.distribute(loop, tasks, learn, team_callback) as groups:
+                in_step = loop.run(tasks, progress, self._rng, groups)
+            with RngSwitch(self._rng):
                 progress.on_training_end()
             self._can_continue = in_step
         finally:
@@ -258,25 +246,27 @@ class Team:
         action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None = None,
     ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
         """
-        :param observation: {agent: array [n_envs, ...]}, or {agent: one observation}; normalised here if the team normalises
-        :param state: recurrent states as returned by the last call, None at first
-        :param episode_start: bool [n_envs]: where recurrent states start anew
-        :param deterministic: the most likely actions instead of samples
-        :param action_masks: {agent: bool [n_envs, k]} for models that take masks (``env.action_masks()``); or a dict of each
-            copy's masks, as sb3-contrib's ``MaskableEvalCallback`` and ``evaluate_policy`` get them from the environment
-        :return: {agent: action(s)} and the recurrent states (None if no agent has any)
-        :raises ValueError: if an agent's observation is missing
+        Predict the actions of all agents.
+
+        :param observation: Observations by agent, ``[n_envs, ...]`` or a single one each; normalised here if the team is
+        :param state: Recurrent states as returned by the last call, None at first
+        :param episode_start: Where recurrent states start anew, bool ``[n_envs]``
+        :param deterministic: Whether to take the most likely actions instead of samples
+        :param action_masks: Masks by agent, bool ``[n_envs, k]``, for models that take masks (``env.action_masks()``); or a
+            sequence of each copy's masks, as sb3-contrib's ``MaskableEvalCallback`` and ``evaluate_policy`` pass them on
+        :return: Action(s) by agent, and the recurrent states (None if no agent has any)
+        :raises ValueError: If an agent's observation is missing
         """
         missing = [agent for agent in self.possible_agents if agent not in observation]
         if missing:
             raise ValueError(f"No observation for {missing}; a team predicts from {{agent: observation}} of all its agents.")
         if action_masks is not None and not isinstance(action_masks, Mapping):
             action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
-        self._jobs.look()
+        self._parallel.sync_models()
         actions: TeamObs = {}
         states: dict[str, PolicyState] = {}
         for agent in self.possible_agents:
-            actions[agent], states[agent] = self._models.actor(agent).predict(
+            actions[agent], states[agent] = self._agents.predictor(agent).predict(
                 observation[agent],
                 None if state is None else state[agent],
                 episode_start,
@@ -287,16 +277,16 @@ class Team:
 
     @property
     def takes_masks(self) -> bool:
-        """Whether an agent's model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
-        return any(self._models.actor(agent).takes_masks for agent in self.possible_agents)
+        """Whether a model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
+        return any(self._agents.predictor(agent).takes_masks for agent in self.possible_agents)
 
     def save(self, path: str | os.PathLike | io.BufferedIOBase) -> None:
         """
-        Save the team as one zip; ``agents/<agent>.zip`` in it are normal SB3 zips that load and predict alone.
+        Save the team as one zip. Each ``agents/<agent>.zip`` in it is a normal SB3 zip that loads and predicts alone.
 
-        A file already there is replaced only when the new one is complete.
+        An existing file is replaced only when the new one is complete.
 
-        :param path: where to (".zip" is added to a name without a suffix), or an open binary file
+        :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
         """
         manifest = {
             "seed": self.seed,
@@ -304,7 +294,7 @@ class Team:
             "normalize": self.normalize,
             **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
-        write_team(path, self.agents, self._models.statistics, manifest)
+        write_team(path, self.agents, self._agents.statistics, manifest)
 
     @classmethod
     def load(
@@ -318,53 +308,53 @@ class Team:
         jobs: int = 1,
     ) -> SelfTeam:
         """
-        :param path: of a saved team, with or without ".zip", or an open binary file
-        :param env: to learn in; its number of copies may differ. None: the team can only predict
-        :param device: of all models
-        :param verbose: as for the constructor
-        :param log_dir: as for the constructor
-        :param tensorboard_log: as for the constructor
-        :param jobs: as for the constructor
-        :return: the team; as with SB3 the random streams start anew from its seed
-        :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged or no saved team, if the environment does not fit it, or for wrong ``jobs``
+        Load a saved team. As with SB3 the random number generators start anew from its seed.
+
+        :param path: Path of a saved team, with or without ".zip", or an open binary file
+        :param env: Environment to learn in, whose number of copies may differ; None for a team that can only predict
+        :param device: As in the constructor
+        :param verbose: As in the constructor
+        :param log_dir: As in the constructor
+        :param tensorboard_log: As in the constructor
+        :param jobs: As in the constructor
+        :return: The team
+        :raises FileNotFoundError: If there is no such file
+        :raises ValueError: If it is damaged or no saved team, if the environment does not fit it, or if ``jobs`` is wrong
         """
         check_jobs(jobs)
         saved = read_team(path)
-        scheduler = None if env is None else JointLoop(check_env(env))
-        if scheduler is not None:
-            saved.check_env(scheduler.env, scheduler.possible_agents, scheduler.scripted)
-        seed = saved.manifest["seed"]
+        loop = None if env is None else JointLoop(check_team_vec_env(env))
+        if loop is not None:
+            saved.check_env(loop.env, loop.possible_agents, loop.scripted)
+        manifest, seed = saved.manifest, saved.manifest["seed"]
         team = cls.__new__(cls)
-        models = AgentModels.load(saved, scheduler, seed=seed, device=device)
-        team._setup(
-            scheduler, models, saved.scripted, seed, saved.manifest["normalize"], verbose, log_dir, tensorboard_log, jobs
-        )
-        team.num_timesteps = saved.manifest["num_timesteps"]
+        agents = AgentModels.load(saved, loop, seed=seed, device=device)
+        team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
+        team.num_timesteps = manifest["num_timesteps"]
         if env is not None and seed is not None:
             env.seed(seed)
         return team
 
     def get_env(self) -> VecEnv | None:
-        """
-        :return: the team's environment, if it has one
-        """
-        return None if self._scheduler is None else self._scheduler.env
+        """Return the team's environment, if it has one."""
+        return None if self._loop is None else self._loop.env
 
     def set_env(self, env: VecEnv) -> None:
         """
-        :param env: to learn in from now on, with the same agents, scripted others, spaces and number of copies
-        :raises RuntimeError: while the team is learning
-        :raises ValueError: if it does not fit
+        Give the team another environment.
+
+        :param env: Has the same agents, scripted others, spaces and number of copies
+        :raises RuntimeError: If the team is learning
+        :raises ValueError: If the environment does not fit
         """
         if self._learning:
             raise RuntimeError("The environment of a team cannot be changed while it learns.")
-        scheduler = JointLoop(check_env(env))
-        if scheduler.possible_agents != self.possible_agents:
-            raise ValueError(f"The team has the agents {self.possible_agents}, the environment {scheduler.possible_agents}.")
-        if list(scheduler.scripted.items()) != list(self._scripted.items()):
+        loop = JointLoop(check_team_vec_env(env))
+        if loop.possible_agents != self.possible_agents:
+            raise ValueError(f"The team has the agents {self.possible_agents}, the environment {loop.possible_agents}.")
+        if list(loop.scripted.items()) != list(self._scripted.items()):
             raise ValueError(
-                f"The team has learned with the scripted others {self._scripted}, the environment has {scheduler.scripted}."
+                f"The team has learned with the scripted others {self._scripted}, the environment has {loop.scripted}."
             )
         n_envs = next(iter(self.agents.values())).n_envs
         if env.num_envs != n_envs:
@@ -372,17 +362,15 @@ class Team:
                 f"The team's buffers are for {n_envs} copies, the environment has {env.num_envs}: save the team and use"
                 " Team.load(path, env=env), which makes new ones."
             )
-        self._models.move(scheduler)
-        self._scheduler = scheduler
+        self._agents.move(loop)
+        self._loop = loop
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
-        """
-        :return: None: each agent is normalised by itself, not the environment
-        """
+        """Return None: each agent is normalised by itself, not the environment."""
         return None
 
     def dump_logs(self) -> None:
-        """Write the team's table: what has been recorded, and how the episodes and the time went."""
+        """Write the team's table: what has been recorded, and statistics of episodes and time."""
         self._iterations += 1
         elapsed = max((time.time_ns() - self._start_time) / 1e9, sys.float_info.epsilon)
         if self.ep_info_buffer:
@@ -404,15 +392,3 @@ class Team:
             if self._logger is None:
                 self._logger = self._log.team_logger
         return self._log
-
-
-def _learn(
-    model: BaseAlgorithm, callback: BaseCallback, total_timesteps: int, log_interval: int | None, reset_num_timesteps: bool
-) -> None:
-    # None is what SB3's loops take for "never", although they do not say so
-    model.learn(
-        total_timesteps,
-        callback=callback,
-        log_interval=log_interval,  # type: ignore[arg-type]
-        reset_num_timesteps=reset_num_timesteps,
-    )

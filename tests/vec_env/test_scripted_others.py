@@ -15,7 +15,7 @@ from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.team import JointEnv, TeamVecEnv
 from sb3_belief.team.checkpoint import SavedTeam
 from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.vec_env.agent_step import TransitionSplitter
+from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env
 from tests.team.toy_envs import BlinkingEnv, MixedEnv, PartneredEnv, ToyEnv
 
@@ -39,7 +39,7 @@ def play(env, n_steps, seed=0):
         ball = rng.uniform(-1, 1, (env.num_envs, 1)).astype(np.float32)
         actions = {"arrow": rng.integers(0, 3, env.num_envs), "ball": ball}
         step = env.step(actions)
-        record.append((actions, step, scheduler._views.split(actions, step)))
+        record.append((actions, step, scheduler._splitter.split(actions, step)))
     return scheduler, record
 
 

@@ -1,5 +1,5 @@
-"""Policies with equal networks act together: one pass for all, their weights stacked into one tensor for each layer."""
+"""Policies with equal networks make their forward passes in one batch."""
 
-from sb3_belief.team.batched_forward.batched_forward import BatchedForward, batched_forwards
+from sb3_belief.team.batched_forward.batcher import BatchedForward, batched_forwards
 
 __all__ = ["BatchedForward", "batched_forwards"]

@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 from sb3_belief.envs.registry import make_parallel_env
 from sb3_belief.team.agent_models import agent_seed
 from sb3_belief.team.fixed_partners.partners import CallersRng, Partner, PartnerLike
-from sb3_belief.vec_env.agent_step import AgentStep, TransitionSplitter
+from sb3_belief.vec_env.agent_vec_env import AgentStep, TransitionSplitter
 from sb3_belief.vec_env.joint_env import JointEnv, Visibility
 from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 
@@ -90,8 +90,8 @@ class AgentEnv(gym.Env):
         } | joint.scripted_action_spaces
 
         self._joint, self._agents, self._deterministic = joint, agents, deterministic
-        self._views = TransitionSplitter(agents, joint.action_spaces, joint.scripted_action_spaces)
-        self._stream = CallersRng(0)
+        self._splitter = TransitionSplitter(agents, joint.action_spaces, joint.scripted_action_spaces)
+        self._callers_rng = CallersRng(0)
         self._seed: int | None = None
         self._partners: dict[str, Partner] = {}
         self._obs: dict[str, np.ndarray] = {}
@@ -211,17 +211,17 @@ class AgentEnv(gym.Env):
         """
         actions = {self.agent: np.asarray(action)[None]}
         masks = self._team_env.action_masks() or {}
-        self._stream.suspend()
+        self._callers_rng.suspend()
         try:
             for name, partner in self._partners.items():
-                partner.stream.resume()
+                partner.rng.resume()
                 mask = masks[name][0] if name in masks else None
                 actions[name] = partner.act(self._obs[name][0], self._ended[name], mask)[None]
-                partner.stream.suspend()
+                partner.rng.suspend()
         finally:
-            self._stream.resume()
+            self._callers_rng.resume()
         step = self._team_env.step(actions)
-        parts = dict(zip(self._agents, self._views.split(actions, step), strict=True))
+        parts = dict(zip(self._agents, self._splitter.split(actions, step), strict=True))
         self._obs = step[0]
         self._ended = {name: bool(part[2][0]) for name, part in parts.items()}
         return bool(step[2][0]), parts[self.agent]

@@ -77,18 +77,18 @@ class Partner:
         deterministic: bool,
         seed: int | None = None,
     ):
-        self.stream = RngState(seed)
+        self.rng = RngState(seed)
         self._name, self._deterministic = name, deterministic
         self._state: PolicyState = None
         self._new = True
         statistics: VecNormalize | None = None
         if isinstance(given, (str, os.PathLike)):
             # Building a network draws random numbers, which the learner must not miss
-            with RngSwitch(self.stream):
+            with RngSwitch(self.rng):
                 given, statistics = load_model(given, name)
         elif isinstance(given, BaseAlgorithm):
             statistics = given.get_vec_normalize_env()
-        self._actor: Predictor | None = None
+        self._predictor: Predictor | None = None
         if isinstance(given, type) or not (callable(given) or hasattr(given, "predict")):
             raise TypeError(
                 f"The partner {name!r} is {given!r}; it must be an SB3 model, the path of the zip of one, an object with SB3's"
@@ -96,7 +96,7 @@ class Partner:
             )
         if hasattr(given, "predict"):
             _check_spaces(name, given, observation_space, action_space)
-            self._actor = Predictor(given, statistics)
+            self._predictor = Predictor(given, statistics)
         else:
             self._function = given
             self._takes_masks = _takes_masks(given)
@@ -109,11 +109,11 @@ class Partner:
         :return: its action
         :raises TypeError: if ``predict`` returns something else than an action and a state
         """
-        if self._actor is None:
+        if self._predictor is None:
             kwargs = {"action_masks": mask} if self._takes_masks else {}
             return np.asarray(self._function(obs, **kwargs))
         start, self._new = np.array([episode_start or self._new]), False
-        result = self._actor.predict(obs, self._state, start, self._deterministic, mask)
+        result = self._predictor.predict(obs, self._state, start, self._deterministic, mask)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(
                 f"predict() of the partner {self._name!r} returned {result!r}; as SB3's it must return (action, state)."
@@ -127,7 +127,7 @@ class Partner:
         """
         self._state, self._new = None, True
         if seed is not None:
-            self.stream = RngState(seed)
+            self.rng = RngState(seed)
 
 
 def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecNormalize | None]:

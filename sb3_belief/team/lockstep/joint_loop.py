@@ -1,29 +1,32 @@
 """
-JointLoop: several unmodified SB3 models learn in one joint environment.
+Lockstep: several unmodified SB3 models learn in one joint environment.
 
 A joint step is
 
 1. every agent has called ``env.step(action)`` and waits;
-2. the hub steps the joint environment once and lets each agent go on with its own part of the result, up to the point
-   where SB3 calls the callbacks: there each has counted the step, and waits again;
-3. the team's callback runs, once, at just the place where SB3 runs callbacks; then each agent is told whether to go on, does
-   what its algorithm does with the step (store it, at times train and log) and chooses its next action.
+2. the loop steps the joint environment once and resumes each agent with its own part of the result, up to the point where SB3
+   calls the callbacks: there each has counted the step, and waits again;
+3. the team's callback runs, once, at just the place where SB3 runs callbacks; then each agent learns whether training
+   continues, does what its algorithm does with the step (store it, at times train and log) and chooses its next action.
 
-So whoever stops the training, all stop after the same step, and nobody has trained on a step that others have not seen. In
-each process there is one thread and one order: the team's. So runs are deterministic. Every agent draws from a random stream
-of its own (``RngState``), and so does what runs in the hub: the environment in this process and the team's callbacks.
+So a callback that stops the training stops all agents after the same step, and no agent has trained on a step that others have
+not seen. Each agent draws random numbers from generators of its own (``RngState``); the environment in this process and the
+team's callbacks share another one.
 """
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.rng import RngState, RngSwitch
-from sb3_belief.team.lockstep.agent_task import (
+from sb3_belief.team.lockstep.scheduler import (
     ACTS,
     BATCHES_FORWARD,
     COUNTED,
@@ -32,66 +35,156 @@ from sb3_belief.team.lockstep.agent_task import (
     UPDATES,
     UPDATES_HERE,
     AgentTask,
-    Observer,
+    Scheduler,
 )
-from sb3_belief.team.lockstep.scheduler import Scheduler
-from sb3_belief.vec_env.agent_step import AgentTransition, TransitionSplitter
+from sb3_belief.team.logs import TeamLog
+from sb3_belief.vec_env.agent_vec_env import AgentTransition, TransitionSplitter
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 
 class AgentGroup(Protocol):
     """
-    Agents of the team whose models learn in another process, in lockstep with those here.
+    Agents of the team whose models learn in another process, in lockstep with those in this one.
 
-    :param agents: who they are
+    :param agents: Their names
     """
 
     agents: list[str]
 
     def start(self, first: TeamObs, masks: TeamObs | None, vote: bool) -> None:
         """
-        Let them go up to their first actions.
+        Run the agents up to their first actions.
 
-        :param first: their observations, if the environment was reset
-        :param masks: of all agents, if there are any
-        :param vote: whether there is something between counting a step and what follows
+        :param first: Their observations, if the environment has been reset
+        :param masks: The masks of all agents, if there are any
+        :param vote: Whether a callback may run between counting a step and what follows
         """
 
-    def step(self, parts: dict[str, AgentTransition], masks: TeamObs | None) -> None:
+    def step(self, transitions: dict[str, AgentTransition], masks: TeamObs | None) -> None:
         """
-        Let them count the step and, where there is no vote, go on.
+        Let the agents count the step and, where there is no vote, finish it.
 
-        :param parts: of all agents
-        :param masks: of all agents, if there are any
+        :param transitions: The parts of all agents
+        :param masks: The masks of all agents, if there are any
         """
 
-    def go_on(self, go_on: bool) -> None:
+    def finish_step(self, continues: bool) -> None:
         """
-        Let them do the rest.
+        Let the agents do what follows after counting the step.
 
-        :param go_on: the result of the vote
+        :param continues: Whether training continues
         """
 
     def end_rollouts(self) -> None:
-        """Let those who have ended a rollout be updated and go on."""
+        """Let the agents that have ended a rollout train on it and choose their next actions."""
 
     def act(self, agents: Sequence[str]) -> None:
         """
-        :param agents: who have finished learning, and are to act once more
+        Let agents act that have finished learning.
+
+        :param agents: Their names
         """
 
     def result(self) -> tuple[dict[str, str], TeamObs]:
         """
-        :return: {agent: why it waits} and {agent: what it does}, of those who have gone on since the last time
-        :raises BaseException: what one of them raised
+        Wait for what was asked of the group last.
+
+        :return: The state and the actions of each agent that has been resumed since the last result
+        :raises BaseException: Whatever one of the agents raised
         """
+
+
+class LearningTeam(Protocol):
+    """What :class:`TeamProgress` counts and logs for, and what callbacks get as their model: a ``Team``."""
+
+    num_timesteps: int
+    ep_info_buffer: deque[dict[str, Any]]
+    ep_success_buffer: deque[bool]
+
+    @property
+    def logger(self) -> Logger:
+        """The team's logger."""
+
+    def dump_logs(self) -> None:
+        """Write the team's table."""
+
+
+class TeamProgress:
+    """
+    What happens between the agents while a team learns: the team's callback, its counters and its log.
+
+    All of it draws from the team's own random number generators.
+
+    :param team: The team
+    :param callback: Its callback
+    :param log: Its loggers
+    """
+
+    def __init__(self, team: LearningTeam, callback: BaseCallback, log: TeamLog):
+        self._team, self._callback, self._log = team, callback, log
+        #: Whether there is a callback that may look at the agents, or stop the training
+        self.has_callback = not (isinstance(callback, ConvertCallback) and callback.callback is None)
+        callback.init_callback(team)  # type: ignore[arg-type]
+
+    def on_training_start(self, locals_: dict[str, Any]) -> None:
+        """
+        Tell the callback that training starts.
+
+        :param locals_: What callbacks find in ``self.locals``
+        """
+        self._callback.on_training_start(locals_, globals())
+
+    def on_rollout_start(self) -> None:
+        """Tell the callback, before the first step of a rollout."""
+        self._callback.on_rollout_start()
+
+    def on_step(self, actions: TeamObs, step: TeamStep) -> bool:
+        """
+        Count a joint step and run the callback.
+
+        :param actions: The actions of this step, by agent
+        :param step: What the joint environment returned
+        :return: Whether training continues
+        """
+        obs, rewards, dones, infos = step
+        self._team.num_timesteps += len(dones)
+        continues = True
+        if self.has_callback:
+            locals_ = {"actions": actions, "new_obs": obs, "rewards": rewards, "dones": dones, "infos": infos}
+            self._callback.update_locals(locals_)
+            continues = self._callback.on_step()
+        if dones.any():
+            for info in infos:
+                if "episode" in info:
+                    self._team.ep_info_buffer.append(info["episode"])
+                    if "is_success" in info:
+                        self._team.ep_success_buffer.append(info["is_success"])
+        return continues
+
+    def on_rollout_end(self) -> None:
+        """Tell the callback when all agents that still learn have ended a rollout, before they train on it."""
+        self._callback.on_rollout_end()
+
+    def on_round_end(self, learning: list[str]) -> None:
+        """
+        Write the team's table when agents that ended rollouts have trained on them.
+
+        :param learning: The agents that still learn
+        """
+        if self._log.complete(learning):
+            self._log.record_means(self._team.logger)
+            self._team.dump_logs()
+
+    def on_training_end(self) -> None:
+        """Tell the callback that training has ended."""
+        self._callback.on_training_end()
 
 
 class JointLoop(Scheduler):
     """
-    The hub between a joint environment and the models of its agents.
+    Steps a joint environment with the actions of all agents, and schedules the agents in between.
 
-    :param env: a ``TeamVecEnv``, or SB3 wrappers around one
+    :param env: A ``TeamVecEnv``, or SB3 wrappers around one
     """
 
     def __init__(self, env: VecEnv):
@@ -102,8 +195,8 @@ class JointLoop(Scheduler):
         self._team_env = team_env
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
-        self._remote_groups: Sequence[AgentGroup] = ()
-        #: Who learns in them
+        self._groups: Sequence[AgentGroup] = ()
+        #: The agents that learn in these groups
         self._elsewhere: set[str] = set()
         self._in_round = False
         self.n_steps = 0
@@ -115,13 +208,11 @@ class JointLoop(Scheduler):
             deepcopy(team_env.scripted_action_spaces),
             env.render_mode,
         )
-        self._views = TransitionSplitter(self.possible_agents, self.action_spaces, self.scripted_action_spaces)
+        self._splitter = TransitionSplitter(self.possible_agents, self.action_spaces, self.scripted_action_spaces)
 
     @property
     def scripted(self) -> dict[str, str]:
-        """
-        :return: {name of a scripted other: its action space in words}, in order
-        """
+        """The action space of each scripted other as text, in order."""
         return {name: str(space) for name, space in self.scripted_action_spaces.items()}
 
     @property
@@ -138,38 +229,38 @@ class JointLoop(Scheduler):
         :param agent: who is about to be updated
         :return: whether it has ended its rollout and does so in its own ``learn()``, so that it can wait for others who do
         """
-        return self._in_round and self._is_in_turn(agent)
+        return self._in_round and self._runs_now(agent)
 
     def reset(self) -> None:
-        """Reset the joint environment; every agent is then given its first observation in its ``learn()``."""
+        """Reset the joint environment; each agent gets its first observation in its ``learn()``."""
         self._obs = self.env.reset()  # type: ignore[assignment]
         self._masks_known = False
         self._first = {agent: self._obs[agent] for agent in self.possible_agents}
         self._starts = {agent: np.ones(self.num_envs, dtype=bool) for agent in self.possible_agents}
 
     def run(
-        self, tasks: dict[str, AgentTask], observer: Observer, stream: RngState, remote_groups: Sequence[AgentGroup] = ()
+        self, tasks: dict[str, AgentTask], progress: TeamProgress, rng: RngState, groups: Sequence[AgentGroup] = ()
     ) -> bool:
         """
-        Let all members learn until each has finished. Who has finished earlier goes on acting.
+        Let all agents learn until each has finished. Agents that finish earlier continue to act.
 
-        :param members: one for each agent
-        :param observer: the team
-        :param stream: what the environment in this process and the observer draw from
-        :param branches: in which some of the agents learn
-        :return: whether all have seen the last step to its end, so that they can go on from there: not after a callback has
-            stopped them (SB3 drops the step at hand), nor if one had finished earlier
-        :raises BaseException: whatever one of them raised, after all others were stopped
+        :param tasks: One for each agent
+        :param progress: The team's callback, counters and log
+        :param rng: Random number generators of the environment in this process and of ``progress``
+        :param groups: The agents that learn in other processes
+        :return: Whether all agents have completed the last step, so that they can continue from there: not after a callback
+            has stopped them (SB3 drops the step at hand), nor if one of them finished earlier than others
+        :raises BaseException: Whatever an agent raised, after all others were stopped
         """
         self._tasks = {agent: tasks[agent] for agent in self.possible_agents}
-        self._remote_groups, self._elsewhere = remote_groups, {agent for group in remote_groups for agent in group.agents}
+        self._groups, self._elsewhere = groups, {agent for group in groups for agent in group.agents}
         self.n_steps, self.n_rounds = 0, 0
-        # Without any callback nobody could see who has counted a step, nor stop the others: then the second stop is left out
-        self._vote = observer.has_callback or any(task.callback is not None for task in tasks.values())
+        # Without any callback nothing can see which agents have counted a step, nor stop them: the second stop is left out
+        self._vote = progress.has_callback or any(task.callback is not None for task in tasks.values())
         try:
-            with RngSwitch(stream) as streams:
+            with RngSwitch(rng) as rngs:
                 try:
-                    return self._run(observer, stream, streams)
+                    return self._run(progress, rng, rngs)
                 except BaseException as error:
                     self._stop_all(error)
                     add_note(
@@ -180,108 +271,109 @@ class JointLoop(Scheduler):
                     raise
         finally:
             self._main, self._tasks, self._in_round = None, {}, False
-            self._remote_groups, self._elsewhere = (), set()
-            self._parts, self._actions = {}, {}
+            self._groups, self._elsewhere = (), set()
+            self._transitions, self._actions = {}, {}
 
-    def _run(self, observer: Observer, stream: RngState, streams: RngSwitch) -> bool:
+    def _run(self, progress: TeamProgress, rng: RngState, rngs: RngSwitch) -> bool:
         tasks = self._tasks
-        for group in self._remote_groups:
+        for group in self._groups:
             first = {agent: self._first.pop(agent) for agent in group.agents if agent in self._first}
             group.start(first, self.masks, self._vote)
-        self._start(self._here(tasks), streams)
+        self._start(self._in_this_process(tasks), rngs)
         self._join()
-        # Who has ended a rollout since the team's last one ended
+        # The agents that have ended a rollout since the last rollout of the whole team ended
         ended: set[str] = set()
         learning, all_together = self._learning(), False
-        streams.to(stream)
-        observer.on_rollout_start()
+        rngs.to(rng)
+        progress.on_rollout_start()
         while learning:
-            self._await_actions(streams)
+            self._batch_forwards(rngs)
             all_together = len(learning) == len(tasks)
             if not all_together:
-                self._let_finished_act(streams)
-            streams.to(stream)
+                self._let_finished_act(rngs)
+            rngs.to(rng)
             actions = {agent: np.asarray(self._actions[agent]) for agent in tasks}
             step = self._step(actions)
-            learning_here = self._here(learning)
+            learning_here = self._in_this_process(learning)
             for agent in learning_here if self._vote else ():
-                # Only the user's callbacks may draw random numbers here; without them the exchange of streams is spared
+                # Up to the vote only the user's callbacks may draw random numbers; without them nothing need be exchanged
                 if tasks[agent].callback is not None:
-                    streams.to(tasks[agent].stream)
+                    rngs.to(tasks[agent].rng)
                 self._resume(agent)
-            streams.to(stream)
-            self._go_on = observer.on_step(actions, step) and self._go_on
-            for group in self._remote_groups if self._vote else ():
-                group.go_on(self._go_on)
-            self._take_turns([a for a in learning_here if tasks[a].state == COUNTED or not self._vote], streams)
-            if self._remote_groups:
+            rngs.to(rng)
+            self._continues = progress.on_step(actions, step) and self._continues
+            for group in self._groups if self._vote else ():
+                group.finish_step(self._continues)
+            self._take_turns([a for a in learning_here if tasks[a].state == COUNTED or not self._vote], rngs)
+            if self._groups:
                 if self._all_act(learning_here):
-                    self._await_actions(streams)
+                    # While the groups are busy, too
+                    self._batch_forwards(rngs)
                 self._join()
             if not self._all_act(learning):
                 if any(task.state == ROLLOUT_ENDED for task in tasks.values()):
-                    self._end_rollouts(ended, observer, stream, streams)
+                    self._end_rollouts(ended, progress, rng, rngs)
                 learning = self._learning()
-        return self._go_on and all_together
+        return self._continues and all_together
 
-    def _here(self, agents: Iterable[str]) -> list[str]:
+    def _in_this_process(self, agents: Iterable[str]) -> list[str]:
         return [agent for agent in agents if agent not in self._elsewhere]
 
     def _all_act(self, agents: Sequence[str]) -> bool:
         return all(self._tasks[agent].state in (ACTS, BATCHES_FORWARD) for agent in agents)
 
     def _join(self) -> None:
-        """Wait for what the agents elsewhere do."""
-        for group in self._remote_groups:
+        """Wait for the agents that learn elsewhere."""
+        for group in self._groups:
             states, actions = group.result()
             self._actions.update(actions)
             for agent, state in states.items():
                 self._tasks[agent].state = state
 
-    def _let_finished_act(self, streams: RngSwitch) -> None:
+    def _let_finished_act(self, rngs: RngSwitch) -> None:
         finished = [agent for agent, task in self._tasks.items() if task.state == FINISHED]
-        for group in self._remote_groups:
+        for group in self._groups:
             theirs = [agent for agent in finished if agent in group.agents]
             if theirs:
                 group.act(theirs)
-        for agent in self._here(finished):
-            self._act(agent, streams)
+        for agent in self._in_this_process(finished):
+            self._act(agent, rngs)
         self._join()
 
-    def _end_rollouts(self, ended: set[str], observer: Observer, stream: RngState, streams: RngSwitch) -> None:
+    def _end_rollouts(self, ended: set[str], progress: TeamProgress, rng: RngState, rngs: RngSwitch) -> None:
         now = [agent for agent, task in self._tasks.items() if task.state == ROLLOUT_ENDED]
         ended.update(now)
-        streams.to(stream)
+        rngs.to(rng)
         team_ended = ended.issuperset(self._learning())
         if team_ended:
             ended.clear()
-            observer.on_rollout_end()
-        # Whoever is updated goes on to its next action at once
+            progress.on_rollout_end()
+        # Each agent trains and chooses its next action in one turn
         self._in_round, self.n_rounds = True, self.n_rounds + 1
-        for group in self._remote_groups:
+        for group in self._groups:
             if not set(now).isdisjoint(group.agents):
                 group.end_rollouts()
-        turns = now = self._here(now)
+        turns = now = self._in_this_process(now)
         while turns:
-            self._take_turns(turns, streams)
+            self._take_turns(turns, rngs)
             # With updates in several processes: first who is updated here, while the workers are busy, then all in their order
             here = [agent for agent in now if self._tasks[agent].state == UPDATES_HERE]
             turns = here or [agent for agent in now if self._tasks[agent].state == UPDATES]
         self._join()
         self._in_round = False
-        streams.to(stream)
+        rngs.to(rng)
         learning = self._learning()
-        observer.on_round_end(learning)
+        progress.on_round_end(learning)
         if team_ended and learning:
-            observer.on_rollout_start()
+            progress.on_rollout_start()
 
     def _step(self, actions: TeamObs) -> TeamStep:
         self.n_steps += 1
-        self._go_on = True
+        self._continues = True
         step: TeamStep = self.env.step(actions)  # type: ignore[arg-type, assignment]
         self._masks_known = False
-        parts = self._views.parts(actions, step)
-        self._hand_out(dict(zip(self.possible_agents, parts, strict=True)))
-        for group in self._remote_groups:
-            group.step(self._parts, self.masks)
+        transitions = self._splitter.transitions(actions, step)
+        self._hand_out(dict(zip(self.possible_agents, transitions, strict=True)))
+        for group in self._groups:
+            group.step(self._transitions, self.masks)
         return step

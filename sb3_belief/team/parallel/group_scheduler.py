@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.common.rng import RngState, RngSwitch
-from sb3_belief.team.lockstep.agent_task import ROLLOUT_ENDED, AgentTask
-from sb3_belief.team.lockstep.scheduler import Scheduler
-from sb3_belief.vec_env.agent_step import AgentTransition
+from sb3_belief.team.lockstep.scheduler import ROLLOUT_ENDED, AgentTask, Scheduler
+from sb3_belief.vec_env.agent_vec_env import AgentTransition
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
 
@@ -50,18 +49,18 @@ class GroupScheduler(Scheduler):
         :param masks: of the agents, if there are any
         """
         self._hand_out(parts)
-        self._given_masks, self._go_on = masks, True
+        self._given_masks, self._continues = masks, True
         if self._vote:
             for agent in self._learning():
                 self._resume(agent)
         else:
-            self.go_on(True)
+            self.finish_step(True)
 
-    def go_on(self, go_on: bool) -> None:
+    def finish_step(self, continues: bool) -> None:
         """
-        :param go_on: the result of the vote
+        :param continues: whether training continues
         """
-        self._go_on = go_on
+        self._continues = continues
         learning = self._learning()
         self._take_turns(learning, self._streams)
         self._end_turns(learning)
@@ -100,6 +99,6 @@ class GroupScheduler(Scheduler):
         return states, {agent: self._actions[agent] for agent in moved if agent in self._actions}
 
     def _end_turns(self, moved: Iterable[str]) -> None:
-        self._await_actions(self._streams)
+        self._batch_forwards(self._streams)
         self._streams.to(self._idle)
         self._moved.update(moved)

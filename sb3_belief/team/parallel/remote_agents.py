@@ -20,7 +20,7 @@ from sb3_belief.team.parallel.messages import dumps, loads
 from sb3_belief.team.parallel.updating import modules_of, pack_of, raise_failure, show, tell, write_buffer, write_changes
 from sb3_belief.team.parallel.worker_server import AgentPayload, Command, state_of, wrappers_of
 from sb3_belief.team.parallel.workers import Workers
-from sb3_belief.vec_env.agent_step import AgentTransition
+from sb3_belief.vec_env.agent_vec_env import AgentTransition
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
 if TYPE_CHECKING:
@@ -135,8 +135,8 @@ class RemoteAgents:
     def step(self, parts: dict[str, AgentTransition], masks: TeamObs | None) -> None:
         self._send("step", {agent: parts[agent] for agent in self.agents}, self._of_these(masks), is_answered=not self._vote)
 
-    def go_on(self, go_on: bool) -> None:
-        self._send("go_on", go_on)
+    def finish_step(self, continues: bool) -> None:
+        self._send("finish_step", continues)
 
     def end_rollouts(self) -> None:
         self._send("end_rollouts")

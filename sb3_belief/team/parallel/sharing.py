@@ -18,7 +18,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
-from sb3_belief.team.lockstep.agent_task import UPDATES, UPDATES_HERE, AgentTask
+from sb3_belief.team.lockstep.scheduler import UPDATES, UPDATES_HERE, AgentTask
 from sb3_belief.team.parallel.remote_agents import RemoteAgents, can_learn_elsewhere, leaves_models_alone
 from sb3_belief.team.parallel.updating import REPLACED, pack_of, read_stream, unpack_result, write_stream
 from sb3_belief.team.parallel.workers import Workers
@@ -38,7 +38,7 @@ def check_jobs(jobs: Any) -> int:
     return jobs
 
 
-class Jobs:
+class ParallelLearning:
     """
     Who learns in which process: the n-th on-policy agent in process n modulo their number, the last of which is this one.
 
@@ -64,13 +64,13 @@ class Jobs:
                 )
         return found
 
-    def look(self) -> None:
+    def sync_models(self) -> None:
         """Make the models here what they are where they learn."""
         for group in self._remote_groups:
             group.look()
 
     @contextmanager
-    def shared_out(
+    def distribute(
         self, scheduler: "JointLoop", tasks: Mapping[str, AgentTask], learn: Callable[..., None], callback: BaseCallback
     ) -> Iterator[Sequence[RemoteAgents]]:
         """

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_n
 
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.batched_forward import batched_forwards
-from sb3_belief.team.lockstep.agent_task import AgentTask
+from sb3_belief.team.lockstep.scheduler import AgentTask
 from sb3_belief.team.parallel.arrived import ModelSnapshot, Recorder, captured, failure_of, rebuild
 from sb3_belief.team.parallel.group_scheduler import GroupScheduler
 from sb3_belief.team.parallel.messages import Message, dumps, loads
@@ -133,7 +133,7 @@ class WorkerServer:
                 env = wrapper
             model.env, model._vec_normalize_env = env, unwrap_vec_normalize(env)
             self._before[agent], self._streams[agent] = ModelSnapshot(model), stream
-            tasks[agent] = AgentTask(partial(learn, model), Predictor(model, model._vec_normalize_env).go_on, stream)
+            tasks[agent] = AgentTask(partial(learn, model), Predictor(model, model._vec_normalize_env).act, stream)
         self._unchecked = set(tasks)
         self._stack.enter_context(batched_forwards(scheduler, self._models))  # type: ignore[arg-type]
         self._scheduler = scheduler

@@ -13,8 +13,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy
-from sb3_belief.team.batched_forward import networks, passes
-from sb3_belief.team.batched_forward.passes import ForwardRequest
+from sb3_belief.team.batched_forward import batcher
+from sb3_belief.team.batched_forward.batcher import ForwardRequest
 from tests.team.helpers import Team, make_team_env
 from tests.team.parallel.test_jobs import Draws, OwnNetwork, Pushes, everything
 from tests.team.toy_envs import ToyEnv
@@ -29,15 +29,15 @@ def sizes(monkeypatch):
     :return: of how many agents the passes were that have been made together
     """
     found: list[int] = []
-    call = networks.StackedNetworks.__call__
+    call = batcher.StackedNetworks.__call__
 
     def count(self, flat, noise):
         found.append(len(flat))
         return call(self, flat, noise)
 
-    monkeypatch.setattr(networks.StackedNetworks, "__call__", count)
+    monkeypatch.setattr(batcher.StackedNetworks, "__call__", count)
     # Without those that only try out whether they agree
-    monkeypatch.setattr(passes, "_agrees", Agrees())
+    monkeypatch.setattr(batcher, "_agrees", Agrees())
     return found
 
 
@@ -57,7 +57,7 @@ def learn_both_ways(monkeypatch, sizes, n_rollouts=3, callback=None, **kwargs):
     for alone in (True, False):
         with monkeypatch.context() as patch:
             if alone:
-                patch.setattr(passes, "signature", lambda policy: None)
+                patch.setattr(batcher, "signature", lambda policy: None)
             sizes.clear()
             team = toy_team(**kwargs)
             n_steps = next(iter(team.agents.values())).n_steps
@@ -104,7 +104,7 @@ def test_the_same_is_learned(case, monkeypatch, sizes):
 
 
 def test_the_policies_that_act_together_are_the_ones_that_agree(monkeypatch, sizes):
-    monkeypatch.setattr(passes, "_agrees", {})
+    monkeypatch.setattr(batcher, "_agrees", {})
     found = learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]})
     # Tried out once
     assert found == [3] * 25
@@ -217,6 +217,6 @@ def make_policies(n):
 
 def test_a_policy_unlike_any_of_sb3_acts_by_itself():
     with th.no_grad():
-        assert not ForwardRequest(th.nn.Linear(2, 2)).can_take(th.zeros(1, 2))
-        assert ForwardRequest(make_policies(1)[0]).can_take(th.zeros(1, 6))
-    assert not ForwardRequest(make_policies(1)[0]).can_take(th.zeros(1, 6))
+        assert not ForwardRequest(th.nn.Linear(2, 2)).accepts(th.zeros(1, 2))
+        assert ForwardRequest(make_policies(1)[0]).accepts(th.zeros(1, 6))
+    assert not ForwardRequest(make_policies(1)[0]).accepts(th.zeros(1, 6))

@@ -96,7 +96,7 @@ def team_steps(make, agent, actions, n_steps):
     parts = []
     for t in range(n_steps):
         joint = {name: column[t][None] for name, column in actions.items()}
-        parts.append(scheduler._views.split(joint, env.step(joint))[env.possible_agents.index(agent)])
+        parts.append(scheduler._splitter.split(joint, env.step(joint))[env.possible_agents.index(agent)])
     env.close()
     return first, parts
 

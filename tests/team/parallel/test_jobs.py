@@ -78,7 +78,7 @@ def rollout_of(model):
 
 
 def statistics_of(team, agent):
-    found = team._models.statistics.get(agent)
+    found = team._agents.statistics.get(agent)
     return None if found is None else [found.obs_rms.mean, found.obs_rms.var, found.ret_rms.var, found.returns]
 
 
@@ -86,7 +86,7 @@ def everything(team, callbacks):
     obs = team.get_env().reset()
     kept: dict[str, Any] = {"prediction": team.predict(obs, deterministic=True)[0]}
     for agent, model in team.agents.items():
-        stream = team._models.streams[agent]
+        stream = team._agents.rngs[agent]
         logged = {key: value for key, value in model.logger.name_to_value.items() if not key.startswith("time/")}
         kept[agent] = {
             "policy": dict(model.policy.state_dict()),

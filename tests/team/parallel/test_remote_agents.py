@@ -176,7 +176,7 @@ def test_who_looks_sees_what_they_are(case, tmp_path):
             for agent, model in loaded.agents.items():
                 names = ("num_timesteps", "_n_updates", "_last_obs", "_last_episode_starts", "_current_progress_remaining")
                 counts = {name: vars(model)[name] for name in names}
-                statistics = loaded._models.statistics.get(agent)
+                statistics = loaded._agents.statistics.get(agent)
                 saved[path.name, agent] = flat(
                     {
                         **counts,

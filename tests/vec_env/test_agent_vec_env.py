@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.vec_env.agent_step import TransitionSplitter
+from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from tests.team.helpers import make_team_env
 from tests.team.toy_envs import MixedEnv, ScriptedEnv
 
@@ -26,7 +26,7 @@ def test_others_actions_are_what_gymnasium_flattens():
     env.reset()
     for t in range(7):
         actions = sample(env, 10 * t)
-        parts = scheduler._views.split(actions, step := env.step(actions))
+        parts = scheduler._splitter.split(actions, step := env.step(actions))
         for i, (agent, part) in enumerate(zip(AGENTS, parts, strict=True)):
             others = [other for other in AGENTS if other != agent]
             assert np.array_equal(part[1], [info["agent_rewards"][i] for info in step[3]])
