@@ -6,7 +6,7 @@ from sb3_belief.envs.traffic_junction.policies import (
     RulePolicy,
     all_brake,
     all_gas,
-    evaluate,
+    evaluate_junction_policy,
     success_rate,
 )
 from tests.envs.scenarios import BOTTOM, EAST, LEFT, RIGHT, STRAIGHT, TOP, WEST, observe, put, quiet_core
@@ -34,7 +34,7 @@ EPISODES = 2048
     ],
 )
 def test_success_of_the_reference_policies(policy, order, arrival_rate, expected, tolerance):
-    result = evaluate(policy, EPISODES, seed=0, order=order, arrival_rate=arrival_rate)
+    result = evaluate_junction_policy(policy, EPISODES, seed=0, order=order, arrival_rate=arrival_rate)
     assert result.episodes == EPISODES
     assert result.success_rate == pytest.approx(expected, abs=tolerance)
     if arrival_rate == 0.2:
@@ -111,15 +111,15 @@ def test_rule_from_observations_equals_the_rule_from_the_state_until_a_collision
 
 
 def test_evaluation_is_reproducible_and_counts_what_it_says():
-    first = evaluate(all_gas, 65, seed=3, n_envs=16, level="easy")
+    first = evaluate_junction_policy(all_gas, 65, seed=3, n_envs=16, level="easy")
     assert first.episodes == 80, "every copy plays the same number"
-    assert first == evaluate(all_gas, 65, seed=3, n_envs=16, level="easy")
+    assert first == evaluate_junction_policy(all_gas, 65, seed=3, n_envs=16, level="easy")
     assert first.success_rate == success_rate(all_gas, 65, seed=3, n_envs=16, level="easy")
-    assert first != evaluate(all_gas, 65, seed=4, n_envs=16, level="easy")
-    empty = evaluate(all_gas, 4, n_envs=4, arrival_rate=0.0)
+    assert first != evaluate_junction_policy(all_gas, 65, seed=4, n_envs=16, level="easy")
+    empty = evaluate_junction_policy(all_gas, 4, n_envs=4, arrival_rate=0.0)
     assert (empty.success_rate, empty.occupancy, empty.visible, empty.mean_return) == (1.0, 0.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="episodes=0"):
-        evaluate(all_gas, 0)
+        evaluate_junction_policy(all_gas, 0)
 
 
 def test_random_policy_is_seeded_and_even():

@@ -400,7 +400,7 @@ def test_state_of_a_batch_resumes_exactly():
     [
         ({"m": 1}, "m=1 must be an integer >= 2"),
         ({"m": 2.0}, "m=2.0 must be an integer"),
-        ({"K": 0}, "K=0 must be an integer >= 1: for how many rollouts a convention lives, or None"),
+        ({"K": 0}, "K=0 must be an integer >= 1: for how many rollouts a convention is valid, or None"),
         ({"K": True}, "K=True must be"),
         ({"rollout_steps": 0}, "rollout_steps=0 must be an integer >= 1"),
         ({"rewarded": "first"}, "rewarded='first' is not one of 'always', 'last'"),

@@ -6,7 +6,7 @@ from pettingzoo import ParallelEnv
 
 from sb3_belief.envs import TrafficJunction
 from sb3_belief.envs.env_util import make_team_env
-from sb3_belief.envs.traffic_junction.policies import all_gas, evaluate
+from sb3_belief.envs.traffic_junction.policies import all_gas, evaluate_junction_policy
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
 
 VARIANTS = [
@@ -118,7 +118,7 @@ def test_a_batch_has_the_statistics_of_single_copies():
         successes += infos["car_0"]["is_success"]
         occupancies.append(occupancy)
         env.reset()
-    batch = evaluate(all_gas, 2048, seed=1, arrival_rate=0.1)
+    batch = evaluate_junction_policy(all_gas, 2048, seed=1, arrival_rate=0.1)
     single = successes / episodes
     assert abs(single - batch.success_rate) < 4 * np.sqrt(batch.standard_error**2 + single * (1 - single) / episodes)
     assert abs(np.mean(occupancies) - batch.occupancy) < 5 * np.std(occupancies) / np.sqrt(episodes)

@@ -1,4 +1,4 @@
-"""Switching conventions: a follower must do what a scripted leader does, who changes its mind."""
+"""Switching conventions: a follower has to match a scripted leader, which changes its behaviour from time to time."""
 
 from sb3_belief.envs.switching_convention.parallel_env import SwitchingConvention
 

@@ -1,7 +1,8 @@
 """
 The rules of the switching conventions, for many copies at once.
 
-:class:`ConventionGame` knows nothing of agents' names, dictionaries or Gym interfaces: arrays [n_copies] go in and out.
+:class:`ConventionGame` takes and returns arrays [n_copies]. Names of agents, dictionaries and Gym interfaces are added by
+the environments that use it.
 """
 
 from dataclasses import asdict, dataclass
@@ -16,13 +17,16 @@ REWARDED = ("always", "last")
 @dataclass(frozen=True)
 class ConventionConfig:
     """
-    :param m: number of cues and of actions, >= 2
-    :param K: number of rollouts for which a convention lives, >= 1; None: for ever
-    :param rollout_steps: steps of one copy in a rollout, >= 1; also the length of an episode
-    :param rewarded: in which of a convention's rollouts the reward counts: ``"always"``, or ``"last"`` for the last only
-    :param leader_visible: whether the leader's actions can be observed
-    :param seed: of the sequence of conventions, >= 0
-    :raises ValueError: for a value outside of these
+    The rules of a switching convention.
+
+    :param m: Number of cues and of actions, >= 2
+    :param K: Number of rollouts for which a convention is valid, >= 1. None if it never changes
+    :param rollout_steps: Steps of one copy in a rollout, >= 1. Also the length of an episode
+    :param rewarded: In which of a convention's rollouts the follower is rewarded: ``"always"``, or ``"last"`` for the last
+        one only
+    :param leader_visible: Whether the follower can observe the leader's actions
+    :param seed: Seed of the sequence of conventions, >= 0
+    :raises ValueError: For any other value
     """
 
     m: int = 4
@@ -35,7 +39,12 @@ class ConventionConfig:
     def __post_init__(self) -> None:
         for name, value, least, meaning in (
             ("m", self.m, 2, "the number of cues and actions"),
-            ("K", 1 if self.K is None else self.K, 1, "for how many rollouts a convention lives, or None for ever"),
+            (
+                "K",
+                1 if self.K is None else self.K,
+                1,
+                "for how many rollouts a convention is valid, or None for all",
+            ),
             ("rollout_steps", self.rollout_steps, 1, "the n_steps of the learner"),
             ("seed", self.seed, 0, "which decides the sequence of conventions"),
         ):
@@ -45,22 +54,25 @@ class ConventionConfig:
             raise ValueError(f"rewarded={self.rewarded!r} is not one of {', '.join(map(repr, REWARDED))}.")
         if self.rewarded == "last" and self.K is None:
             raise ValueError(
-                "rewarded='last' with K=None would never reward: a convention that lives for ever has no last rollout."
+                "rewarded='last' with K=None would never reward: a convention that never changes has no last rollout."
                 " Give K a number, or use rewarded='always'."
             )
         if not isinstance(self.leader_visible, bool):
             raise ValueError(f"leader_visible={self.leader_visible!r} must be True or False.")
 
 
-# The copies ask for the same ones at the same time
+# Cached, because all copies need the same convention at the same time
 @lru_cache(maxsize=128)
 def convention(m: int, seed: int, number: int) -> np.ndarray:
     """
-    :param m: number of cues
-    :param seed: of the sequence
-    :param number: which convention of the sequence, from 0
-    :return: int64 [m], a uniformly drawn permutation: what the leader plays at each cue; read-only
+    Return one convention of a sequence.
+
+    :param m: Number of cues
+    :param seed: Seed of the sequence
+    :param number: Position in the sequence, from 0
+    :return: The leader's action at each cue, int64 [m], a permutation drawn uniformly. The array is read-only
     """
+    # A seed of its own for each position, so that any convention can be drawn without those before it
     drawn = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).permutation(m)
     drawn.flags.writeable = False
     return drawn
@@ -68,50 +80,53 @@ def convention(m: int, seed: int, number: int) -> np.ndarray:
 
 class ConventionGame:
     """
-    ``n_copies`` followers, each beside the same leader. Each copy has a random generator of its own, and the cues of an
-    episode are drawn at its start in one call: a copy therefore lives the same life alone and in a batch.
+    ``n_copies`` independent followers that are stepped together, each with a leader that follows the same conventions.
 
-    :param n_copies: number of copies
-    :param config: the rules
+    Each copy has a random generator of its own, and the cues of an episode are drawn at its start in one call. A copy with a
+    given seed therefore behaves the same alone and in a batch.
+
+    :param n_copies: Number of environment copies
+    :param config: The rules
     """
 
     def __init__(self, n_copies: int, config: ConventionConfig):
         self.config = config
         self.n_copies = n_copies
         self.generators = [np.random.default_rng() for _ in range(n_copies)]
-        # One more than there are steps: the last is the observation after the last step
+        # One cue more than there are steps, since there is an observation after the last step too
         self.cues = np.zeros((n_copies, config.rollout_steps + 1), dtype=np.int64)
         self.time = np.zeros(n_copies, dtype=np.int64)
+        # Steps since the copy was last seeded. Unlike time it is not reset with an episode, and it determines the convention
         self.age = np.zeros(n_copies, dtype=np.int64)
         self.leader = np.zeros(n_copies, dtype=np.int64)
         self.conventions = np.zeros((n_copies, config.m), dtype=np.int64)
         self._copy = np.arange(n_copies)
-        self._life = None if config.K is None else config.K * config.rollout_steps
-        self._renew(self._copy)
+        self._convention_steps = None if config.K is None else config.K * config.rollout_steps
+        self._update_conventions(self._copy)
 
     @property
     def cue(self) -> np.ndarray:
-        """
-        :return: int64 [n_copies], what the followers see now
-        """
+        """The cues that the followers observe now, int64 [n_copies]."""
         return self.cues[self._copy, self.time]
 
     def seed(self, copy: int, seed: int | None) -> None:
         """
-        Let a copy begin its life anew: with the first convention, and from its next reset on with cues from the seed.
+        Seed one copy, which starts again with the first convention.
 
-        :param copy: number of the copy
-        :param seed: of its cues
+        The convention changes at once. The new random generator is used for cues from the copy's next reset on.
+
+        :param copy: Index of the copy
+        :param seed: Seed of its cues, or None for one from the operating system
         """
         self.generators[copy] = np.random.default_rng(seed)
         self.age[copy] = 0
-        self._renew(np.array([copy]))
+        self._update_conventions(np.array([copy]))
 
     def reset(self, copies: np.ndarray | None = None) -> None:
         """
-        Start new episodes. Conventions stay as they are: the copies' lives go on.
+        Start new episodes. The conventions do not change.
 
-        :param copies: int [k], which copies; None: all
+        :param copies: Indices of the copies to reset, int [k]. None for all
         """
         chosen = self._copy if copies is None else copies
         self.time[chosen] = 0
@@ -120,31 +135,35 @@ class ConventionGame:
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param actions: int [n_copies], of the followers, each in [0, m)
-        :return: rewards float32 [n_copies], and bool [n_copies], whose episode has come to its end; what the leader did at
-            the same cues is ``leader``
+        Advance all copies by one step and store the leader's actions at the same cues in ``leader``. No copy is reset.
+
+        :param actions: Actions of the followers, int [n_copies], each in [0, m)
+        :return: Rewards, float32 [n_copies], and whether the episode has ended, bool [n_copies]
         """
         self.leader = self.conventions[self._copy, self.cue]
         rewards = (actions == self.leader).astype(np.float32)
         if self.config.rewarded == "last":
+            # age // rollout_steps is the number of the rollout, and a convention is valid for K of them
             rewards[self.age // self.config.rollout_steps % self.config.K != self.config.K - 1] = 0.0  # type: ignore[operator]
         self.time += 1
         self.age += 1
-        if self._life is not None:
-            due = np.flatnonzero(self.age % self._life == 0)
+        if self._convention_steps is not None:
+            due = np.flatnonzero(self.age % self._convention_steps == 0)
             if len(due):
-                self._renew(due)
+                self._update_conventions(due)
         return rewards, self.time >= self.config.rollout_steps
 
-    def _renew(self, copies: np.ndarray) -> None:
+    def _update_conventions(self, copies: np.ndarray) -> None:
         for copy in copies:
-            number = 0 if self._life is None else int(self.age[copy]) // self._life
+            number = 0 if self._convention_steps is None else int(self.age[copy]) // self._convention_steps
             self.conventions[copy] = convention(self.config.m, self.config.seed, number)
 
     def get_state(self, copy: int) -> dict[str, Any]:
         """
-        :param copy: number of the copy
-        :return: all that decides its future, as arrays and plain data (copies)
+        Return everything that determines the following steps of one copy.
+
+        :param copy: Index of the copy
+        :return: Copies of arrays and plain data
         """
         return {
             "config": asdict(self.config),
@@ -155,9 +174,11 @@ class ConventionGame:
 
     def set_state(self, copy: int, state: dict[str, Any]) -> None:
         """
-        :param copy: number of the copy
-        :param state: what ``get_state`` returned, of a copy with the same rules
-        :raises ValueError: if the rules differ
+        Restore one copy.
+
+        :param copy: Index of the copy
+        :param state: State that ``get_state`` returned for a copy with the same rules
+        :raises ValueError: If the rules differ
         """
         rules = asdict(self.config)
         if state["config"] != rules:
@@ -169,4 +190,5 @@ class ConventionGame:
         self.generators[copy].bit_generator.state = state["generator"]
         for name in ("time", "age", "leader"):
             getattr(self, name)[copy] = state[name]
-        self._renew(np.array([copy]))
+        # The convention is not part of the state, since age determines it
+        self._update_conventions(np.array([copy]))

@@ -1,4 +1,4 @@
-"""The switching conventions as a PettingZoo environment."""
+"""The switching convention as a PettingZoo environment."""
 
 from typing import Any, ClassVar
 
@@ -13,47 +13,51 @@ FOLLOWER, LEADER = "follower", "leader"
 
 class SwitchingConvention(TeamGame[int, int]):
     """
-    A follower sees a cue x, uniform of m, and at the same time a scripted leader plays c(x): c, the convention, is a
-    permutation of range(m). The follower is rewarded with 1 if it played the same, else with 0. What the leader did is never
-    in an observation: the follower learns of it afterwards, by ``others_actions``, as of a teammate. All that an
-    agent can know of a convention is thus in its history, and a new one is drawn, uniformly, every K rollouts.
+    Game in which a follower has to match a scripted leader, whose behaviour changes every K rollouts.
 
-    These are tests of whether a belief is *dynamic*: whether it follows a change of the other's behaviour without a gradient
-    step. Weights cannot do it, since the next convention is as likely one as the other:
+    The follower observes a cue x, drawn uniformly from m cues, while the leader plays c(x). The convention c is a permutation
+    of range(m). The follower gets the reward 1 if it played the same action, and otherwise 0. The leader's action is never in
+    an observation. The follower receives it after the step in ``others_actions``, like that of a teammate. All that an agent
+    can know about a convention is therefore in its history, and a new convention is drawn uniformly every K rollouts.
+
+    The game tests whether a belief is *dynamic*, that is whether it follows a change of another agent's behaviour without a
+    gradient step. Weights alone cannot, since all conventions are equally likely to be the next one. Mean reward per step:
 
     ========================================================  ===========================  ================================
-    the game                                                  without history              the best there is
+    game                                                      without history              optimum
     ========================================================  ===========================  ================================
     ``convention-swap`` (T1): train with K=2, then freeze     1/m on a fresh convention    1.0 there, once the history holds
-    all weights and let the history watch a fresh                                          each cue of it
+    all weights and let the history record a fresh                                         each cue of it
     convention (another ``seed``, K=None)
-    ``convention-watch-act`` (T2): K=2, the reward counts     1/m in the second            1.0 in the second
-    in the second rollout only                                rollout
-    ``convention-redraw`` (T3): K=5, the reward counts        1/m, or more by what is      (K-1+1/m)/K: 1/m in a
-    always                                                    learned within K rollouts    convention's first rollout, then 1
+    ``convention-watch-act`` (T2): K=2, only the second       1/m in the second            1.0 in the second
+    rollout is rewarded                                       rollout                      rollout
+    ``convention-redraw`` (T3): K=5, every rollout is         1/m, or more by what is      (K-1+1/m)/K: 1/m in a
+    rewarded                                                  learned within K rollouts    convention's first rollout, then 1
     ========================================================  ===========================  ================================
 
-    Negative controls, in which a belief cannot help: ``K=1`` (a history lags by one rollout, so it is always of another
-    convention: 1/m is the best), ``leader_visible=False`` (nothing can be known but by reward), and ``K=None``, a stationary
-    leader that any learner comes to match by its weights alone (1.0).
+    A belief cannot help in these negative controls:
 
-    For a history to hold one convention only, let it be no longer than a rollout: ``history_length <= rollout_steps *
-    n_envs``. Averages over all rollouts of ``convention-watch-act`` count the first ones too, which are not rewarded: 1/2 at
-    best. Read ``rollout/ep_rew_mean`` (of ``rollout_steps`` at most) and not an evaluation during training: an evaluation
-    environment lives a life of its own, so its convention is not the one that the follower's history is of.
+    - ``K=1``: the history lags by one rollout and so always holds another convention. The optimum is 1/m
+    - ``leader_visible=False``: only the reward tells anything about the leader
+    - ``K=None``: the leader is stationary, and any learner matches it by its weights alone (1.0)
 
-    An episode is ``rollout_steps`` long and ends by termination: no step has consequences for a later one, so there is nothing
-    to bootstrap from. Conventions do not change with episodes but every ``K * rollout_steps`` steps of the environment's
-    life; a reset with a seed begins that life anew, one without a seed goes on.
+    A history that is no longer than a rollout, ``history_length <= rollout_steps * n_envs``, holds one convention only. The
+    mean over all rollouts of ``convention-watch-act`` is at most 1/2, since it includes the first ones, which are not
+    rewarded. During training read ``rollout/ep_rew_mean`` (at most ``rollout_steps``) instead of an evaluation. An evaluation
+    environment counts its own steps, so its convention is not the one that the follower's history holds.
 
-    :param m: number of cues and of actions, >= 2
-    :param K: number of rollouts for which a convention lives, >= 1; None: for ever
-    :param rollout_steps: steps of one copy in a rollout, >= 1: must equal the learner's ``n_steps``
-    :param rewarded: ``"always"``, or ``"last"``: the reward counts only in the last of a convention's K rollouts
-    :param leader_visible: whether the follower is told what the leader did
-    :param seed: decides the sequence of conventions, >= 0. All copies made with it meet the same one, since it is the same
-        leader; the seed given to ``reset`` decides the cues.
-    :raises ValueError: for a value outside of these, and for ``rewarded="last"`` with ``K=None``
+    An episode has ``rollout_steps`` steps and terminates, since no step has consequences for later ones and there is nothing
+    to bootstrap from. A convention is valid across episodes, for ``K * rollout_steps`` steps of the environment. A reset with
+    a seed starts again with the first convention. A reset without one does not change it.
+
+    :param m: Number of cues and of actions, >= 2
+    :param K: Number of rollouts for which a convention is valid, >= 1. None if it never changes
+    :param rollout_steps: Steps of one copy in a rollout, >= 1. It must equal the learner's ``n_steps``
+    :param rewarded: ``"always"``, or ``"last"`` to reward only the last of a convention's K rollouts
+    :param leader_visible: Whether the follower can observe the leader's actions
+    :param seed: Seed of the sequence of conventions, >= 0. All copies made with the same seed have the same leader. The seed
+        of ``reset`` determines the cues
+    :raises ValueError: For any other value, and for ``rewarded="last"`` with ``K=None``
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "switching_convention_v0", "render_modes": [], "is_parallelizable": True}
@@ -78,18 +82,19 @@ class SwitchingConvention(TeamGame[int, int]):
 
     @property
     def convention(self) -> np.ndarray:
-        """
-        :return: int64 [m], what the leader plays at each cue, in the next step
-        """
+        """The leader's action at each cue in the next step, int64 [m]."""
         return self.game.conventions[0].copy()
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, int], dict[str, dict[str, Any]]]:
         """
-        :param seed: of the cues; the environment's life begins anew, with its first convention. None: both go on
-        :param options: not used
-        :return: the first cue and an empty info, by agent
+        Start an episode.
+
+        :param seed: Seed of the cues. The environment also starts again with its first convention. With None both the cues
+            and the convention continue
+        :param options: Not used
+        :return: The first cue and an empty info, by agent
         """
         if seed is not None:
             self.game.seed(0, seed)
@@ -101,14 +106,16 @@ class SwitchingConvention(TeamGame[int, int]):
         self, actions: dict[str, int]
     ) -> tuple[dict[str, int], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """
-        :param actions: the follower's action, in [0, m)
-        :return: next cue, reward, termination (True at the last step of an episode), truncation (False) and an empty info, by
+        Advance the episode by one step.
+
+        :param actions: Action of the follower, in [0, m)
+        :return: Next cue, reward, termination (True at the last step of an episode), truncation (False) and an empty info, by
             agent
-        :raises ValueError: if the action is missing or there is no such action, or if no episode is under way
+        :raises ValueError: If the action is missing or outside its range, or if no episode is under way
         """
         self._require_episode()
         if FOLLOWER not in actions:
-            raise ValueError(f"No action for {FOLLOWER!r}, the one who acts here; got actions for {list(actions)}.")
+            raise ValueError(f"No action for {FOLLOWER!r}, the agent that acts here; got actions for {list(actions)}.")
         action = actions[FOLLOWER]
         if action not in range(self.config.m):
             raise ValueError(f"The action of {FOLLOWER!r} is {action!r}; allowed are the integers 0 to {self.config.m - 1}.")
@@ -121,28 +128,34 @@ class SwitchingConvention(TeamGame[int, int]):
 
     def scripted_actions(self) -> dict[str, int]:
         """
-        :return: what the leader did in the last step, at the cue that the follower saw before it
+        Return the leader's action of the last step.
+
+        :return: Its action at the cue that the follower observed before that step, in [0, m)
         """
         return {LEADER: int(self.game.leader[0])}
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: bool [1]: whether the follower is told what the leader did in the last step
+        Return whether the follower could observe the leader's action of the last step.
+
+        :return: {follower: bool [1]}
         """
         return {FOLLOWER: np.array([self.config.leader_visible])}
 
     def get_state(self) -> dict[str, Any]:
         """
-        :return: all that decides how the episode and those after it go on, as arrays and plain data
+        Return everything that determines the rest of this episode and the following ones.
+
+        :return: Arrays and plain data
         """
         return {"game": self.game.get_state(0), "under_way": bool(self.agents)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        Go on where ``get_state`` was called; given the same actions, everything that follows is the same bit for bit.
+        Restore a state. With the same actions, everything that follows is then the same bit for bit.
 
-        :param state: what ``get_state`` returned in an environment with the same arguments
-        :raises ValueError: if the arguments differ
+        :param state: State that ``get_state`` returned in an environment with the same arguments
+        :raises ValueError: If the arguments differ
         """
         self.game.set_state(0, state["game"])
         self.agents = [FOLLOWER] if state["under_way"] else []

@@ -1,4 +1,4 @@
-"""Many switching conventions stepped at once."""
+"""Many copies of the switching convention that are stepped at once."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,14 +14,15 @@ from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 class SwitchingConventionVecEnv(TeamVecEnv):
     """
-    ``num_envs`` copies of :class:`SwitchingConvention` in one numpy game, beside the same leader. Copy i seeded with s + i
-    (as ``seed(s)`` does, whose s is not the ``seed`` of the conventions) lives the same life, bit for bit, as one
-    :class:`SwitchingConvention` that was reset with the seed s + i and then without one. ``get_attr("convention")`` gives
-    each copy's current convention.
+    Vectorised environment of ``num_envs`` copies of :class:`SwitchingConvention` in one numpy game, all with the same leader.
 
-    :param num_envs: number of copies, at least 1
-    :param env_kwargs: the arguments of :class:`SwitchingConvention`
-    :raises ValueError: for a value that is not allowed
+    ``seed(s)`` seeds copy i with s + i, where s is not the argument ``seed`` of the conventions. That copy then behaves the
+    same, bit for bit, as one :class:`SwitchingConvention` that is reset with the seed s + i at first and without a seed
+    afterwards. ``get_attr("convention")`` returns the current convention of each copy.
+
+    :param num_envs: Number of environment copies, at least 1
+    :param env_kwargs: The arguments of :class:`SwitchingConvention`
+    :raises ValueError: For a value that is not allowed
     """
 
     def __init__(self, num_envs: int, **env_kwargs: Any):
@@ -33,7 +34,7 @@ class SwitchingConventionVecEnv(TeamVecEnv):
         scripted: dict[str, spaces.Space] = {LEADER: spaces.Discrete(self.config.m)}
         super().__init__(num_envs, [FOLLOWER], numbers, numbers, scripted_action_spaces=scripted)
         self._one_hot = np.eye(self.config.m, dtype=np.float32)
-        # What all infos have in common
+        # All infos share these arrays, which are therefore read-only
         self._always = {
             "visible": np.array([[self.config.leader_visible]]),
             "active": np.ones(1, dtype=bool),
@@ -44,6 +45,13 @@ class SwitchingConventionVecEnv(TeamVecEnv):
             shared.flags.writeable = False
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        Return an attribute of each copy.
+
+        :param attr_name: Name of the attribute. ``"convention"`` gives each copy's current convention, int64 [m]
+        :param indices: Indices of the copies. None for all
+        :return: One value for each of these copies
+        """
         if attr_name == "convention":
             return [self.game.conventions[copy].copy() for copy in self._get_indices(indices)]
         return super().get_attr(attr_name, indices)
@@ -72,22 +80,24 @@ class SwitchingConventionVecEnv(TeamVecEnv):
                 infos[copy]["terminal_observation"] = {FOLLOWER: cues[copy]}
             self.game.reset(ended)
             cues = self.game.cue
-        # The team's only agent: its reward is the team's, but nobody may get at the other's array
+        # The follower is the only agent, so its reward is also the team's. A copy, so that the infos have arrays of their own
         return {FOLLOWER: cues}, rewards.copy(), dones, infos
 
     def get_state(self) -> list[dict[str, Any]]:
         """
-        :return: for each copy all that decides how it goes on
+        Return everything that determines the following steps of each copy.
+
+        :return: One state for each copy
         """
         return [self.game.get_state(copy) for copy in range(self.num_envs)]
 
     def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
         """
-        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+        Restore the states of all copies. The monitored returns and lengths of the running episodes start from zero.
 
-        :param states: what ``get_state`` returned with as many copies and the same arguments
-        :return: the current cues, {agent: int64 [num_envs]}
-        :raises ValueError: if the number of copies or the arguments differ
+        :param states: States that ``get_state`` returned for as many copies with the same arguments
+        :return: The current cues, {agent: int64 [num_envs]}
+        :raises ValueError: If the number of copies or the arguments differ
         """
         if len(states) != self.num_envs:
             raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")

@@ -1,4 +1,4 @@
-"""What a user can choose about the Traffic Junction, checked in one place."""
+"""The arguments of the Traffic Junction and their validation."""
 
 from dataclasses import dataclass
 
@@ -11,15 +11,19 @@ REWARDS = ("own", "team")
 @dataclass(frozen=True)
 class JunctionConfig:
     """
+    The rules of a Traffic Junction.
+
     :param level: ``"easy"``, ``"medium"`` or ``"hard"``
-    :param order: order of events in a step, ``"commnet"`` (move, collisions, removal, arrivals) or ``"ic3net"`` (move and
+    :param order: Order of events in a step: ``"commnet"`` (move, collisions, removal, arrivals) or ``"ic3net"`` (move and
         removal, arrivals, collisions)
-    :param reward: ``"own"`` (each car its own) or ``"team"`` (every agent the mean over all slots)
-    :param arrival_rate: probability in [0, 1] that a car wants to enter, per entry and step; None: the level's default
-    :param reward_scale: factor on all rewards, > 0
-    :param vision: a car sees the cells at most this far away in rows and in columns, >= 0 (1: the 3x3 cells around it)
-    :param observe_last_actions: whether the last actions of the cars in view are in the observation
-    :raises ValueError: for a value outside of these
+    :param reward: ``"own"`` (each agent gets the reward of its own car) or ``"team"`` (every agent gets the mean over all
+        slots)
+    :param arrival_rate: Probability in [0, 1] that a car wants to enter, per entry and step. None for the level's default
+    :param reward_scale: Factor on all rewards, > 0
+    :param vision: Largest distance in rows and in columns at which a car sees, in cells, >= 0 (1 shows the 3x3 cells around
+        it)
+    :param observe_last_actions: Whether observations contain the last actions of the cars in view
+    :raises ValueError: For any other value
     """
 
     level: str = "medium"
@@ -49,19 +53,22 @@ class JunctionConfig:
 
     @property
     def level_spec(self) -> Level:
+        """The level of difficulty."""
         return LEVELS[self.level]
 
     @property
     def start_arrival_rate(self) -> float:
-        """The arrival rate of a new environment."""
+        """The arrival rate of a new environment, in [0, 1]."""
         return self.level_spec.arrival_rate if self.arrival_rate is None else float(self.arrival_rate)
 
 
 def check_arrival_rate(arrival_rate: float) -> float:
     """
-    :param arrival_rate: probability per entry and step
-    :return: the same as a float
-    :raises ValueError: if it is not a number in [0, 1]
+    Check an arrival rate.
+
+    :param arrival_rate: Probability that a car wants to enter, per entry and step
+    :return: The same number as a float
+    :raises ValueError: If it is not a number in [0, 1]
     """
     if not _is_number(arrival_rate) or not 0 <= arrival_rate <= 1:
         raise ValueError(f"arrival_rate={arrival_rate!r} must be a probability in [0, 1], per entry and step.")
@@ -69,5 +76,5 @@ def check_arrival_rate(arrival_rate: float) -> float:
 
 
 def _is_number(value: object) -> bool:
-    # numpy scalars come from schedules; they have __float__ without being int or float
+    # Schedules may produce numpy scalars, which have __float__ without being instances of int or float
     return not isinstance(value, bool | str | bytes) and hasattr(value, "__float__")

@@ -1,7 +1,8 @@
 """
 The rules of the Traffic Junction (Sukhbaatar et al. 2016, https://arxiv.org/abs/1605.07736), for many copies at once.
 
-:class:`TrafficCore` knows nothing of agents' names, dictionaries or Gym interfaces: arrays [n_copies, n_cars] go in and out.
+:class:`TrafficCore` takes and returns arrays [n_copies, n_cars]. Names of agents, dictionaries and Gym interfaces are added
+by the environments that use it.
 """
 
 from typing import Any, NamedTuple
@@ -14,20 +15,20 @@ from sb3_belief.envs.traffic_junction.layout import build_layout
 GAS, BRAKE = 0, 1
 
 COLLISION_REWARD = -5.0
-"""For each step and each other car in the same cell."""
+"""Reward per step and per other car in the same cell."""
 WAIT_REWARD = -0.01
-"""For each step, times the number of steps since the car entered."""
+"""Reward per step, multiplied by the number of steps since the car entered."""
 
 
 class Step(NamedTuple):
     """
-    What a step of all copies brought.
+    Result of one step of all copies.
 
-    :param rewards: float64 [n_copies, n_cars]
-    :param acted: bool [n_copies, n_cars], the slots whose car was on the road when the actions were chosen
-    :param left: bool [n_copies, n_cars], the slots whose car reached its destination
-    :param partners: int [n_copies, n_cars], how many other cars the car in the slot collided with
-    :param dones: bool [n_copies], whether the step limit is reached
+    :param rewards: Rewards of the slots, float64 [n_copies, n_cars]
+    :param acted: Slots whose car was on the road when the actions were chosen, bool [n_copies, n_cars]
+    :param left: Slots whose car reached its destination, bool [n_copies, n_cars]
+    :param partners: Number of other cars that the car in the slot collided with, int [n_copies, n_cars]
+    :param dones: Whether the step limit is reached, bool [n_copies]
     """
 
     rewards: np.ndarray
@@ -39,24 +40,26 @@ class Step(NamedTuple):
 
 class TrafficCore:
     """
-    ``n_copies`` junctions side by side. Each has a random generator of its own, and all that an episode needs of it is
-    drawn at the episode's start in one call: a copy therefore lives the same life alone and in a batch, and a step costs
-    no call per copy.
+    ``n_copies`` independent junctions that are stepped together.
+
+    Each copy has a random generator of its own, and all random numbers of an episode are drawn at its start in one call. A
+    copy with a given seed therefore behaves the same alone and in a batch, and a step needs no call per copy.
 
     The order of events in a step is
 
-    - ``commnet``: cars move, tau += 1, collisions, cars on their last cell leave, cars arrive. A car that arrives in an
-      occupied entry cell collides only if it or the other is still there after the next move.
-    - ``ic3net``: cars move, tau += 1, cars that drove on from their last cell leave, cars arrive, collisions. A car that
-      arrives in an occupied entry cell collides at once: the episode has failed, and the car that it hits is punished; it
-      is not itself, since it has not acted yet (its slot may still hold the last step of the car before).
+    - ``commnet``: cars move, tau += 1, collisions are counted, cars on their last cell leave, new cars arrive. A car that
+      arrives in an occupied entry cell collides only if both cars are in one cell after the next move.
+    - ``ic3net``: cars move, tau += 1, cars that drove on from their last cell leave, new cars arrive, collisions are counted.
+      A car that arrives in an occupied entry cell collides at once: the episode has failed and the car that it hits is
+      punished. The new car is not punished, since it has not acted yet (in that step its slot may still belong to the
+      previous car).
 
-    Arrivals: each entry wants a car with the probability ``arrival_rate``; it gets a random free slot (one freed in this
-    very step too) and a random one of the entry's routes, until no slot is free. The road is empty when an episode
-    starts.
+    Arrivals: with the probability ``arrival_rate`` a car wants to enter at an entry. It gets a random free slot, possibly one
+    freed in the same step, and a random route of that entry. Entries are served in their order until no slot is free. The
+    road is empty when an episode starts.
 
-    :param n_copies: number of copies
-    :param config: the rules
+    :param n_copies: Number of environment copies
+    :param config: The rules
     """
 
     def __init__(self, n_copies: int, config: JunctionConfig):
@@ -75,9 +78,11 @@ class TrafficCore:
         self.on_road = np.zeros(shape, dtype=bool)
         self.time = np.zeros(n_copies, dtype=np.int64)
         self.n_collisions = np.zeros(n_copies, dtype=np.int64)
-        # per step: [wish to enter, choice of route] of each entry, and the precedence of each slot
+        # The random numbers of each step: for each entry whether a car wants to enter, for each entry the choice of its
+        # route, and for each slot its rank among the free ones. They lie in [0, 1)
         self.draws = np.zeros((n_copies, self.max_steps, 2 * self.n_entries + self.n_cars))
-        # crashed[:, cell]: whether cars collided there in the last step; one more cell for the cars that are nowhere
+        # crashed[:, cell] says whether cars collided there in the last step. The additional last cell is where the layout
+        # puts all cars that are not on the road
         self._n_cells = level.size**2 + 1
         self.crashed = np.zeros((n_copies, self._n_cells), dtype=bool)
         self._copy = np.arange(n_copies)
@@ -85,15 +90,19 @@ class TrafficCore:
 
     def set_arrival_rate(self, arrival_rate: float) -> None:
         """
-        :param arrival_rate: from the next step on, in [0, 1]
-        :raises ValueError: outside of it
+        Set the arrival rate of all copies from the next step on.
+
+        :param arrival_rate: Probability in [0, 1] that a car wants to enter, per entry and step
+        :raises ValueError: If it is not a number in [0, 1]
         """
         self.arrival_rate = check_arrival_rate(arrival_rate)
 
     def seed(self, copy: int, seed: int | None) -> None:
         """
-        :param copy: number of the copy
-        :param seed: seed of its generator from its next reset on
+        Seed the random generator of one copy. The seed takes effect at its next reset.
+
+        :param copy: Index of the copy
+        :param seed: Seed, or None for one from the operating system
         """
         self.generators[copy] = np.random.default_rng(seed)
 
@@ -101,7 +110,7 @@ class TrafficCore:
         """
         Start new episodes on empty roads.
 
-        :param copies: int [k], which copies; None: all
+        :param copies: Indices of the copies to reset, int [k]. None for all
         """
         chosen = self._copy if copies is None else copies
         self.place[chosen] = self.layout.nowhere
@@ -113,13 +122,17 @@ class TrafficCore:
 
     def step(self, actions: np.ndarray) -> Step:
         """
-        :param actions: int [n_copies, n_cars], 0 gas, 1 brake; those of slots without a car are ignored
-        :return: what happened
+        Advance all copies by one step. No copy is reset.
+
+        :param actions: 0 (gas) or 1 (brake), int [n_copies, n_cars]. Those of slots without a car are ignored
+        :return: Rewards and events of the step
         """
         acted = self.on_road.copy()
         self.last_action = np.where(acted, actions, GAS)
         self.place += acted & (actions == GAS)
         self.tau += acted
+        # Only cars that are on the road when collisions are counted get a reward. With commnet cars leave after that, so they
+        # are all that have acted
         if self.config.order == "commnet":
             partners = self._collide()
             waited = acted
@@ -142,14 +155,16 @@ class TrafficCore:
 
     def _collide(self) -> np.ndarray:
         """
-        :return: int [n_copies, n_cars], number of other cars in the same cell
+        Count collisions and remember their cells.
+
+        :return: Number of other cars in the same cell, int [n_copies, n_cars]
         """
         cells = self.layout.cell[self.place] + self._cell_offset
         counts = np.bincount(cells.ravel(), minlength=self.crashed.size)
         partners = np.where(self.on_road, counts[cells] - 1, 0)
         self.crashed = counts.reshape(self.crashed.shape) > 1
         self.crashed[:, -1] = False
-        # a pair counts once: each of the two is the other's partner
+        # Each of two colliding cars has the other as its partner, but the pair is one collision
         self.n_collisions += partners.sum(axis=1) // 2
         return partners
 
@@ -162,12 +177,14 @@ class TrafficCore:
     def _arrive(self) -> None:
         draws = self.draws[self._copy, self.time]
         wishes = draws[:, : self.n_entries] < self.arrival_rate
+        # The k-th entry with a wish is served if at least k slots are free
         rank = wishes.cumsum(axis=1)
         n_free = self.n_cars - self.on_road.sum(axis=1, keepdims=True)
         copies, entries = np.nonzero(wishes & (rank <= n_free))
         if not len(copies):
             return
-        # the free slots first, in random order: the k-th arrival takes the k-th of them
+        # Adding on_road (1 for occupied slots) to numbers in [0, 1) sorts the free slots to the front, in random order. The
+        # k-th arrival takes the k-th of them
         slots = np.argsort(draws[:, 2 * self.n_entries :] + self.on_road, axis=1)[copies, rank[copies, entries] - 1]
         routes_of = self.layout.entry_routes
         chosen = (draws[copies, self.n_entries + entries] * routes_of.shape[1]).astype(np.int64)
@@ -176,8 +193,10 @@ class TrafficCore:
 
     def get_state(self, copy: int) -> dict[str, Any]:
         """
-        :param copy: number of the copy
-        :return: all that decides its future, as arrays and plain data (copies)
+        Return everything that determines the following steps of one copy.
+
+        :param copy: Index of the copy
+        :return: Copies of arrays and plain data
         """
         state: dict[str, Any] = {name: np.copy(getattr(self, name)[copy]) for name in _STATE_ARRAYS}
         state["arrival_rate"] = self.arrival_rate
@@ -186,9 +205,11 @@ class TrafficCore:
 
     def set_state(self, copy: int, state: dict[str, Any]) -> None:
         """
-        :param copy: number of the copy
-        :param state: what ``get_state`` returned, of a copy of the same level. The arrival rate is one for all copies.
-        :raises ValueError: if it is the state of another level
+        Restore one copy. All copies share one arrival rate, so it is set for all of them.
+
+        :param copy: Index of the copy
+        :param state: State that ``get_state`` returned for a copy of the same level
+        :raises ValueError: If it is the state of another level
         """
         for name in _STATE_ARRAYS:
             given, own = np.shape(state[name]), getattr(self, name)[copy].shape

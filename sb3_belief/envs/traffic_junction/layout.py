@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 Cell = tuple[int, int]
-"""(row, column), row 0 at the top."""
+"""(row, column). Row 0 is at the top."""
 
 SOUTH, NORTH, EAST, WEST = (1, 0), (-1, 0), (0, 1), (0, -1)
 
@@ -15,17 +15,17 @@ SOUTH, NORTH, EAST, WEST = (1, 0), (-1, 0), (0, 1), (0, -1)
 @dataclass(frozen=True)
 class Level:
     """
-    One level of difficulty: where the lanes lie, and the defaults that go with it.
+    One level of difficulty: the position of the lanes and the defaults of the level.
 
-    :param size: the grid is ``size`` x ``size`` cells
-    :param southbound: columns of the lanes that lead down
-    :param northbound: columns of the lanes that lead up
-    :param eastbound: rows of the lanes that lead right
-    :param westbound: rows of the lanes that lead left
-    :param turns: whether cars may turn; otherwise every route is straight
-    :param n_cars: number of slots for cars
-    :param max_steps: length of an episode
-    :param arrival_rate: default probability that a car wants to enter, per entry and step
+    :param size: Number of rows and of columns of the grid
+    :param southbound: Columns of the lanes that lead down
+    :param northbound: Columns of the lanes that lead up
+    :param eastbound: Rows of the lanes that lead right
+    :param westbound: Rows of the lanes that lead left
+    :param turns: Whether cars may turn. Otherwise every route is straight
+    :param n_cars: Number of slots for cars
+    :param max_steps: Length of an episode in steps
+    :param arrival_rate: Default probability that a car wants to enter, per entry and step
     """
 
     size: int
@@ -49,20 +49,23 @@ LEVELS: dict[str, Level] = {
 @dataclass(frozen=True, eq=False)
 class Layout:
     """
-    The lanes of a level and all routes on them. A *place* is a number that says "cell k of route r": ``r * stride + k``. Each
-    route has one place more than cells, *beyond* its last cell, and the last place of all, ``nowhere``, is that of no car.
+    The lanes of a level and all routes on them, as lookup tables.
 
-    :param level: the level
-    :param lanes: for each road cell the directions in which cars may leave it
-    :param entries: first cells of the entering lanes, clockwise from the left end of the upper border
-    :param routes: the cells of every route
-    :param entry_routes: int [n_entries, k], the numbers of the routes that start at each entry
-    :param stride: places per route
-    :param cell: int [n_places], row * size + column; ``size**2`` beyond the end and nowhere
-    :param next_cell: int [n_places], the cell after it; -1 on the last cell, beyond the end and nowhere
-    :param route: int [n_places], number of the route; ``n_routes`` nowhere
-    :param is_last: bool [n_places], whether it is the last cell of its route
-    :param is_beyond: bool [n_places], whether it lies beyond the last cell of its route
+    A *place* is the number ``r * stride + k``, which stands for cell k of route r. A car thus moves by adding 1 to its place.
+    Each route has one place more than it has cells, which lies *beyond* its last cell. The very last place, ``nowhere``, is
+    that of slots without a car.
+
+    :param level: The level
+    :param lanes: For each road cell the directions in which cars may leave it
+    :param entries: First cells of the entering lanes, clockwise from the left end of the upper border
+    :param routes: The cells of every route
+    :param entry_routes: Numbers of the routes that start at each entry, int [n_entries, k]
+    :param stride: Number of places per route
+    :param cell: Cell of each place as row * size + column, int [n_places]. ``size**2`` beyond the end and nowhere
+    :param next_cell: Cell that follows each place, int [n_places]. -1 on the last cell, beyond the end and nowhere
+    :param route: Number of the route of each place, int [n_places]. ``n_routes`` nowhere
+    :param is_last: Whether a place is the last cell of its route, bool [n_places]
+    :param is_beyond: Whether a place lies beyond the last cell of its route, bool [n_places]
     """
 
     level: Level
@@ -79,18 +82,22 @@ class Layout:
 
     @property
     def n_routes(self) -> int:
+        """The number of routes."""
         return len(self.routes)
 
     @property
     def nowhere(self) -> int:
+        """The place of a slot without a car."""
         return len(self.cell) - 1
 
 
 @cache
 def build_layout(name: str) -> Layout:
     """
-    :param name: one of ``LEVELS``
-    :return: its roads and routes (one shared object; treat it as read-only)
+    Return the roads and routes of a level.
+
+    :param name: Name of a level, a key of ``LEVELS``
+    :return: The layout. All callers share one object, so it must not be changed
     """
     level = LEVELS[name]
     lanes = _lanes(level)
@@ -101,11 +108,11 @@ def build_layout(name: str) -> Layout:
     entry_routes = []
     for entry in entries:
         position = _border_position(entry, level.size)
-        # the exits clockwise from the entry, so that the routes of one entry are those of another, rotated
+        # The exits are sorted clockwise from the entry, so that the k-th route of one entry is the k-th of another, rotated
         around = sorted(exits, key=lambda e: (_border_position(e, level.size) - position) % (4 * level.size))
-        found = [_best_route(entry, end, lanes) for end in around if _may_leave_by(entry, end, level)]
-        entry_routes.append(list(range(len(routes), len(routes) + len(found))))
-        routes.extend(found)
+        from_entry = [_best_route(entry, end, lanes) for end in around if _may_leave_by(entry, end, level)]
+        entry_routes.append(list(range(len(routes), len(routes) + len(from_entry))))
+        routes.extend(from_entry)
     return _tabulate(level, lanes, entries, routes, np.array(entry_routes))
 
 
@@ -122,7 +129,7 @@ def _lanes(level: Level) -> dict[Cell, tuple[Cell, ...]]:
 
 
 def _border_position(cell: Cell, size: int) -> int:
-    """Distance along the border, clockwise from the upper left corner; cells inside come last."""
+    """Return the distance along the border, clockwise from the upper left corner. Inner cells come last."""
     row, column = cell
     if row == 0:
         return column
@@ -146,12 +153,13 @@ def _is_exit(cell: Cell, lanes: dict[Cell, tuple[Cell, ...]], size: int) -> bool
 def _may_leave_by(entry: Cell, end: Cell, level: Level) -> bool:
     if not level.turns:
         return entry[0] == end[0] or entry[1] == end[1]
-    # the lane beside the entry would be a U-turn
+    # The exit beside the entry would be a U-turn
     return abs(entry[0] - end[0]) + abs(entry[1] - end[1]) > 1
 
 
 def _best_route(entry: Cell, end: Cell, lanes: dict[Cell, tuple[Cell, ...]]) -> tuple[Cell, ...]:
-    """The route with the fewest turns, then the fewest cells, then the earliest turns (the tie that ``hard`` has)."""
+    """Return the route with the fewest turns, then the fewest cells, then the earliest turns (``hard`` has such ties)."""
+    # Dijkstra's algorithm: the queue is sorted by number of turns, number of cells and positions of the turns
     queue: list[tuple[int, int, tuple[int, ...], tuple[Cell, ...], Cell]] = [(0, 1, (), (entry,), lanes[entry][0])]
     seen: set[tuple[Cell, Cell]] = set()
     while queue:
@@ -168,7 +176,8 @@ def _best_route(entry: Cell, end: Cell, lanes: dict[Cell, tuple[Cell, ...]]) -> 
                 turn = direction != heading
                 where = (*turned_at, length) if turn else turned_at
                 heapq.heappush(queue, (n_turns + turn, length + 1, where, (*path, following), direction))
-    raise AssertionError(f"no route leads from {entry} to {end}")  # the lanes of LEVELS connect every entry to every exit
+    # The lanes of LEVELS connect every entry to every exit
+    raise AssertionError(f"no route leads from {entry} to {end}")
 
 
 def _add(cell: Cell, direction: Cell) -> Cell:

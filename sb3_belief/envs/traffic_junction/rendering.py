@@ -1,4 +1,4 @@
-"""Pictures of a Traffic Junction, drawn with pygame."""
+"""Pictures of a Traffic Junction that are drawn with pygame."""
 
 import math
 from typing import Any
@@ -9,9 +9,9 @@ from sb3_belief.envs.traffic_junction.core import BRAKE, TrafficCore
 from sb3_belief.envs.traffic_junction.layout import Cell, Layout
 
 WIDTH, HUD_HEIGHT = 608, 32
-"""In pixels; the picture is WIDTH x (WIDTH + HUD_HEIGHT), multiples of 16, which video encoders ask for."""
+"""In pixels. The picture is WIDTH x (WIDTH + HUD_HEIGHT), multiples of 16 as video encoders require."""
 _SCALE = 3
-"""Everything is drawn about this much larger and then shrunk, which smooths all edges at once."""
+"""Everything is drawn larger by about this factor and then shrunk, which smooths all edges at once."""
 
 _GRASS, _GRASS_DARK, _KERB, _ASPHALT = (122, 160, 92), (112, 150, 84), (196, 192, 180), (72, 75, 82)
 _PAINT, _PAINT_DIM, _CENTRE = (232, 232, 226), (118, 121, 128), (228, 186, 76)
@@ -27,11 +27,11 @@ _CARS = (
 
 class Renderer:
     """
-    Draws one copy of a core: the road as it is after the last step, and where cars collided in it.
+    Renderer of one copy of a junction: the road after the last step, and the cells where cars collided in that step.
 
-    :param layout: the roads
-    :param max_steps: length of an episode
-    :raises ImportError: if pygame is not installed
+    :param layout: The roads
+    :param max_steps: Length of an episode in steps
+    :raises ImportError: If pygame is not installed
     """
 
     def __init__(self, layout: Layout, max_steps: int):
@@ -51,18 +51,22 @@ class Renderer:
 
     def image(self, core: TrafficCore, copy: int) -> np.ndarray:
         """
-        :param core: the copies
-        :param copy: which one
-        :return: its picture, uint8 [height, width, 3]
+        Return a picture of one copy.
+
+        :param core: The copies
+        :param copy: Index of the copy
+        :return: uint8 [height, width, 3]
         """
         surface = self._draw(core, copy)
         return np.ascontiguousarray(self.pygame.surfarray.array3d(surface).transpose(1, 0, 2))
 
     def show(self, core: TrafficCore, copy: int, fps: int) -> None:
         """
-        :param core: the copies
-        :param copy: which one to show in the window
-        :param fps: wait so that at most this many pictures are shown per second
+        Show one copy in a window, which is opened at the first call.
+
+        :param core: The copies
+        :param copy: Index of the copy
+        :param fps: Largest number of pictures per second. The call waits as long as that requires
         """
         pygame = self.pygame
         surface = self._draw(core, copy)
@@ -72,6 +76,7 @@ class Renderer:
             pygame.display.set_caption("Traffic Junction")
             self._clock = pygame.time.Clock()
         self._window.blit(surface, (0, 0))
+        # Without handling its events the system takes the window for one that hangs
         pygame.event.pump()
         pygame.display.flip()
         self._clock.tick(fps)
@@ -92,7 +97,7 @@ class Renderer:
             sharing.setdefault(int(self.layout.cell[core.place[copy, slot]]), []).append(int(slot))
         for number, cars in sharing.items():
             for k, car in enumerate(cars):
-                # cars in one cell stand a little apart, so that all of them are seen
+                # Cars in one cell are drawn a little apart, so that all of them are visible
                 shift = 0.28 * (k - (len(cars) - 1) / 2) * self._cell
                 self._draw_car(canvas, core, copy, car, self._centre(divmod(number, self.size), shift))
         for cell in crashed:
@@ -134,20 +139,20 @@ class Renderer:
             return
         (down, right) = lanes[cell][0]
         before, after = (cell[0] - down, cell[1] - right), (cell[0] + down, cell[1] + right)
-        # traffic keeps to the right, so the lane of the other direction is to the left: (down, right) turned by a quarter
+        # Traffic keeps to the right, so the oncoming lane is on the left: (down, right) turned by 90 degrees
         beside = (cell[0] - right, cell[1] + down)
         if lanes.get(beside) == ((-down, -right),):
             self._draw_line(canvas, cell, (0.36, 0.5), (-0.36, 0.5), (down, right), _CENTRE, 0.05)
         if len(lanes.get(after, ())) > 1:
             self._draw_line(canvas, cell, (0.44, 0.42), (0.44, -0.42), (down, right), _PAINT, 0.08)
         elif (cell[0] + cell[1]) % 2 == 0 and before in lanes and after in lanes:
-            # an arrow on every other cell: direction of travel
+            # An arrow on every other cell shows the direction of travel
             self._draw_line(canvas, cell, (-0.2, 0.0), (0.16, 0.0), (down, right), _PAINT_DIM, 0.06)
             tip = [self._point(cell, (down, right), *p) for p in ((0.3, 0.0), (0.1, 0.13), (0.1, -0.13))]
             self.pygame.draw.polygon(canvas, _PAINT_DIM, tip)
 
     def _point(self, cell: Cell, heading: Cell, ahead: float, left: float) -> tuple[float, float]:
-        """A point of a cell, given in cells ahead of its centre and to the left of it as seen by a driver."""
+        """Return the pixel coordinates of a point, given in cells ahead and to the left of a cell's centre for a driver."""
         x, y = self._centre(cell)
         down, right = heading
         return x + (ahead * right + left * down) * self._cell, y + (ahead * down - left * right) * self._cell
@@ -177,7 +182,7 @@ class Renderer:
         pygame.draw.rect(body, dark, (0, 0, length, width), border_radius=corner)
         edge = max(1, width // 14)
         pygame.draw.rect(body, colour, (edge, edge, length - 2 * edge, width - 2 * edge), border_radius=corner - edge)
-        # the car faces right before it is turned
+        # The car is drawn facing right and then turned
         pygame.draw.rect(body, _GLASS, (0.7 * length, 0.16 * width, 0.13 * length, 0.68 * width), border_radius=corner // 2)
         pygame.draw.rect(body, _GLASS, (0.1 * length, 0.2 * width, 0.08 * length, 0.6 * width), border_radius=corner // 3)
         for side in (0.1, 0.72):
@@ -220,15 +225,18 @@ class Renderer:
 
     def _font(self, size: int) -> Any:
         if size not in self._fonts:
-            # pygame's own font: the same picture on every machine
+            # The font that pygame ships makes the picture independent of the fonts of the system
             self._fonts[size] = self.pygame.font.Font(None, round(1.3 * size))
         return self._fonts[size]
 
 
 def _headings(layout: Layout) -> np.ndarray:
     """
-    :param layout: the roads
-    :return: where a car faces at each place, in degrees, 0 to the right and 90 up; halfway in the cell where it turns
+    Return the direction that a car faces at each place.
+
+    :param layout: The roads
+    :return: Angles in degrees, [n_places], 0 to the right and 90 up. In a cell where a route turns it is halfway between the
+        two directions
     """
     angles = np.zeros(len(layout.cell))
     for r, path in enumerate(layout.routes):

@@ -1,4 +1,4 @@
-"""Many Traffic Junctions stepped at once."""
+"""Many copies of the Traffic Junction that are stepped at once."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,14 +22,15 @@ from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 class TrafficJunctionVecEnv(TeamVecEnv):
     """
-    ``num_envs`` copies of :class:`TrafficJunction` in one numpy core. Copy i seeded with s + i (as ``seed(s)`` does)
-    lives the same life, bit for bit, as one :class:`TrafficJunction` that was reset with the seed s + i and then without
-    one.
+    Vectorised environment of ``num_envs`` copies of :class:`TrafficJunction` in one numpy core.
 
-    :param num_envs: number of copies
+    ``seed(s)`` seeds copy i with s + i. That copy then behaves the same, bit for bit, as one :class:`TrafficJunction` that is
+    reset with the seed s + i at first and without a seed afterwards.
+
+    :param num_envs: Number of environment copies, at least 1
     :param render_mode: None, ``"rgb_array"`` or ``"human"`` (a window with the first copy)
-    :param env_kwargs: the other arguments of :class:`TrafficJunction`
-    :raises ValueError: for a value that is not allowed
+    :param env_kwargs: The other arguments of :class:`TrafficJunction`
+    :raises ValueError: For a value that is not allowed
     """
 
     def __init__(self, num_envs: int, render_mode: str | None = None, **env_kwargs: Any):
@@ -68,7 +69,7 @@ class TrafficJunctionVecEnv(TeamVecEnv):
         result = self.core.step(joint)
         infos = self._infos(result, saw)
         obs = self._observe()
-        # drawn before the reset, so that a window shows the last step too
+        # Drawn before the reset, so that a window also shows the last step
         self._show()
         ended = np.flatnonzero(result.dones)
         if len(ended):
@@ -95,32 +96,36 @@ class TrafficJunctionVecEnv(TeamVecEnv):
 
     def action_masks(self) -> dict[str, np.ndarray]:
         """
-        :return: {agent: bool [num_envs, 2]}: a slot without a car may only brake
+        Return which actions are possible now.
+
+        :return: {agent: bool [num_envs, 2]}. A slot without a car may only brake
         """
         return dict(zip(self.possible_agents, action_masks(self.core).transpose(1, 0, 2), strict=True))
 
     def set_arrival_rate(self, arrival_rate: float) -> None:
         """
-        Change the traffic in all copies.
+        Set the arrival rate of all copies from the next step on.
 
-        :param arrival_rate: from the next step on, in [0, 1]
-        :raises ValueError: outside of it
+        :param arrival_rate: Probability in [0, 1] that a car wants to enter, per entry and step
+        :raises ValueError: If it is not a number in [0, 1]
         """
         self.core.set_arrival_rate(arrival_rate)
 
     def get_state(self) -> list[dict[str, Any]]:
         """
-        :return: for each copy all that decides how it goes on
+        Return everything that determines the following steps of each copy.
+
+        :return: One state for each copy
         """
         return [self.core.get_state(copy) for copy in range(self.num_envs)]
 
     def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
         """
-        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+        Restore the states of all copies. The monitored returns and lengths of the running episodes start from zero.
 
-        :param states: what ``get_state`` returned with as many copies of the same level
-        :return: the current observations, {agent: array [num_envs, width]}
-        :raises ValueError: if the number of copies or the level differs
+        :param states: States that ``get_state`` returned for as many copies of the same level
+        :return: The current observations, {agent: array [num_envs, width]}
+        :raises ValueError: If the number of copies or the level differs
         """
         if len(states) != self.num_envs:
             raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")
@@ -131,19 +136,23 @@ class TrafficJunctionVecEnv(TeamVecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """
-        :return: a picture of each copy, uint8 [height, width, 3]
+        Return a picture of each copy.
+
+        :return: One array per copy, uint8 [height, width, 3]
         """
         return [self._get_renderer().image(self.core, copy) for copy in range(self.num_envs)]
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
         """
-        :param mode: None: the render mode that the environment was made with
-        :return: the pictures of all copies as tiles of one, or None if the first copy is shown in a window
-        :raises ValueError: if there is no render mode
+        Return a picture of all copies, or show the first copy in a window.
+
+        :param mode: ``"rgb_array"`` or ``"human"``. None for the render mode that the environment was made with
+        :return: The pictures of all copies as tiles of one, uint8 [height, width, 3], or None with ``"human"``
+        :raises ValueError: If there is no render mode
         """
         mode = require_render_mode(check_render_mode(mode or self.render_mode, RENDER_MODES), RENDER_MODES)
         if mode == "human":
-            # SB3's own window needs OpenCV
+            # VecEnv.render would open a window with OpenCV, which this package does not require
             self._get_renderer().show(self.core, 0, fps=TrafficJunction.metadata["render_fps"])
             return None
         return super().render(mode)
