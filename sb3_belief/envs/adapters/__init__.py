@@ -1,6 +1,6 @@
 """
-Environments of other packages as a team needs them: one module per family.
+Adapters that turn environments of other packages into PettingZoo environments, one module or package per suite.
 
-A module has ``make(name, **env_kwargs)``, which returns one copy as a PettingZoo ``ParallelEnv``, and ``names()``. It imports
-its package inside of functions only, so that looking at the registry needs none of them.
+Each has ``make(name, **env_kwargs)``, which returns one copy as a ``ParallelEnv``, and ``names()``. It imports its package
+inside functions only, so that looking up an id needs none of the packages.
 """

@@ -1,4 +1,4 @@
-"""Gymnasium environments of several agents: tuples of spaces, of observations and of actions, one entry per agent."""
+"""Multi-agent Gymnasium environments with tuples of spaces, observations and actions, one entry per agent."""
 
 import copy
 import operator
@@ -20,21 +20,22 @@ Step = tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str,
 
 class GymTupleEnv(TeamGame[np.ndarray, Any]):
     """
-    A Gymnasium environment whose observation and action spaces are ``Tuple``s, one entry for each agent, as a PettingZoo one.
+    PettingZoo environment around a Gymnasium one whose observation and action spaces are ``Tuple`` spaces.
 
-    Agents are called ``agent_0``, ``agent_1`` ... in the order of the tuples. All stay listed until the episode ends for all
-    of them. Rewards may be a sequence with one for each agent, or a single number, which then is everybody's.
+    Agents are called ``agent_0``, ``agent_1``, ... in the order of the tuples. All stay in ``agents`` until the episode ends
+    for all of them. The reward of a step may be a sequence with one entry per agent, or a single number that every agent gets.
 
-    What Gymnasium's interface cannot say is said by a subclass, in the methods whose names begin with an underscore: who sees
-    whom (:meth:`_visible`), which actions are possible (:meth:`_masks`), who is in play (:meth:`_active`), what a success is
-    (:meth:`_is_success`), whether an end that is reported as a termination is a time limit (:meth:`_is_time_limit`). Without
-    them everyone sees everyone, is in play and may do everything.
+    A subclass can override hooks for what Gymnasium's interface cannot express: which agents see each other
+    (:meth:`_visible`), which actions are possible (:meth:`_masks`), which agents are in play (:meth:`_active`), whether an
+    episode was a success (:meth:`_is_success`), and whether a reported termination is a time limit (:meth:`_is_time_limit`).
+    By default all agents see each other, are in play and may take every action.
 
-    :param env: the environment
-    :param max_episode_steps: the episode is truncated after this many steps, >= 1; None: the environment knows its own limit
-    :param name: shown for the environment, e.g. its id
-    :raises TypeError: if its spaces are not tuples of the same length
-    :raises ValueError: if ``max_episode_steps`` is less than 1
+    :param env: The environment
+    :param max_episode_steps: Number of steps after which an episode is truncated, >= 1. None if the environment has a limit of
+        its own
+    :param name: Name of the environment for messages, for instance its id
+    :raises TypeError: If the spaces are not tuples of the same length
+    :raises ValueError: If ``max_episode_steps`` is less than 1
     """
 
     metadata: dict[str, Any]
@@ -49,15 +50,15 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps={max_episode_steps} must be at least 1, or None for no limit of ours.")
         self.gym_env = env
-        #: the environment without Gymnasium's wrappers, of which the methods below ask what they need
+        #: The environment without Gymnasium's wrappers, which the hooks below read
         self.game: Any = env.unwrapped
         self.max_episode_steps = max_episode_steps
         self.possible_agents = [f"agent_{i}" for i in range(len(acted))]
         self.agents: list[str] = []
-        # Packages repeat one space object, but each agent's space has a generator of its own
+        # Packages repeat one space object for all agents. Copies, because each agent's space must have its own generator
         self.observation_spaces: dict[str, spaces.Space] = self._by_agent([copy.deepcopy(space) for space in observed])
         self.action_spaces: dict[str, spaces.Space] = self._by_agent([copy.deepcopy(space) for space in acted])
-        # Looked up at every step
+        # Used at every step. None for spaces other than Discrete from 0, whose actions need a fuller check
         self._n_actions = {
             agent: int(space.n) if isinstance(space, spaces.Discrete) and not space.start else None
             for agent, space in self.action_spaces.items()
@@ -66,45 +67,56 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         self.render_mode = env.render_mode
         name = name or getattr(env.spec, "id", None) or type(self.game).__name__
         self.metadata = {**env.metadata, "name": name, "is_parallelizable": True}
-        #: what the environment itself returned as info of the last step or reset
+        #: The info that the environment itself returned at the last step or reset
         self.info: dict[str, Any] = {}
         self._steps = 0
+        # step() recognises the default of _active() by the identity of _everybody
         self._in_play = self._everybody = np.ones(len(acted), dtype=bool)
         self._saw = np.zeros((len(acted), len(acted) - 1), dtype=bool)
 
-    # What a subclass may say; all of it is asked right after a reset or a step
+    # Hooks for subclasses. Except for _prepare_reset they are called directly after a reset or a step
 
     def _prepare_reset(self) -> None:
-        """Called before each reset."""
+        """Prepare the game for a reset."""
 
     def _visible(self, observations: Sequence[np.ndarray]) -> np.ndarray:
         """
-        :param observations: of the step, one for each agent
-        :return: whose action of this step each agent could observe, bool [n, n-1], the others in order
+        Return whose action of this step each agent could observe.
+
+        :param observations: Observations after the step, one for each agent
+        :return: bool [n, n-1], the others in order
         """
         return np.ones_like(self._saw)
 
     def _masks(self) -> Sequence[np.ndarray] | None:
         """
-        :return: for each agent which of its actions are possible now, bool; None if the environment does not tell
+        Return which actions are possible now.
+
+        :return: One bool array for each agent, or None if the environment has no masks
         """
         return None
 
     def _active(self) -> np.ndarray:
         """
-        :return: who is in play now, bool [n]
+        Return which agents are in play now.
+
+        :return: bool [n]
         """
         return self._everybody
 
     def _is_success(self) -> bool | None:
         """
-        :return: at an episode's end, whether it is a success; None if there is no such thing
+        Return whether an episode that has just ended was a success.
+
+        :return: The success, or None if the environment does not define one
         """
         return None
 
     def _is_time_limit(self) -> bool:
         """
-        :return: when the environment says that it terminated, whether it merely reached a limit of its own
+        Return whether a termination that the environment has just reported is in fact a time limit.
+
+        :return: True to report a truncation instead
         """
         return False
 
@@ -114,10 +126,12 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """
-        :param seed: restarts the environment's generator; None: it goes on
-        :param options: handed to the environment
-        :return: observations and infos, by agent
-        :raises ValueError: if the environment does not give one observation to each agent
+        Start an episode.
+
+        :param seed: Seed of the environment's random generator. With None the generator continues
+        :param options: Passed on to the environment
+        :return: Observations and infos, by agent
+        :raises ValueError: If the environment does not return one observation for each agent
         """
         self._prepare_reset()
         obs, self.info = self.gym_env.reset(seed=seed, options=options)
@@ -129,11 +143,13 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
 
     def step(self, actions: dict[str, Any]) -> Step:
         """
-        :param actions: an action for each agent
-        :return: observations, rewards, terminations, truncations and infos, by agent. Infos have ``action_mask`` if there are
-            masks, ``active`` when somebody was not in play, and at the end ``is_success`` if there is such a thing.
-        :raises ValueError: if an agent's action is missing or not in its space, if no episode is under way, or if the
-            environment returns something else than Gymnasium's five, with one observation and reward for each agent
+        Advance the episode by one step.
+
+        :param actions: Action of each agent
+        :return: Observations, rewards, terminations, truncations and infos, by agent. Infos have ``action_mask`` if there are
+            masks, ``active`` if an agent was not in play, and at the end ``is_success`` if the environment defines it
+        :raises ValueError: If an agent's action is missing or not in its space, if no episode is under way, or if the
+            environment does not return one observation and reward for each agent and single values for the two ends
         """
         self._require_episode()
         was_in_play = self._in_play
@@ -167,14 +183,17 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: whose action of the last step an agent could observe, {agent: bool [n-1]}, the others in the order of
-            ``possible_agents``; all False after ``reset``
+        Return whose action of the last step each agent could observe.
+
+        :return: {agent: bool [n-1]}, the others in the order of ``possible_agents``. All False after ``reset``
         """
         return self._by_agent(self._saw)
 
     def render(self) -> Any:
         """
-        :return: what the environment's own ``render()`` returns
+        Render the environment.
+
+        :return: The result of the environment's own ``render()``
         """
         return self.gym_env.render()
 
@@ -189,7 +208,8 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         if len(obs) != len(self._dtypes):
             raise ValueError(f"{self.metadata['name']} returned {len(obs)} observations for {len(self._dtypes)} agents.")
         if None in self._dtypes:
-            return list(obs)  # nested ones, which have no single type
+            # A nested space has no single type
+            return list(obs)
         return [np.asarray(part, dtype=dtype) for part, dtype in zip(obs, self._dtypes, strict=True)]
 
     def _rewards(self, reward: Any) -> list[float]:
@@ -211,50 +231,56 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
 
     def _joint_action(self, actions: dict[str, Any]) -> list[Any]:
         """
-        :return: the actions in order; those of ``Discrete`` spaces as plain integers, which some packages insist on
+        Return the checked actions in the order of the agents.
+
+        :return: One action for each agent. Those of ``Discrete`` spaces are plain integers, which some packages require
         """
         missing = [agent for agent in self.possible_agents if agent not in actions]
         if missing:
             raise ValueError(f"No action for {missing}; got actions for {list(actions)}.")
-        return [self._checked(agent, actions[agent]) for agent in self.possible_agents]
+        return [self._checked_action(agent, actions[agent]) for agent in self.possible_agents]
 
-    def _checked(self, agent: str, action: Any) -> Any:
+    def _checked_action(self, agent: str, action: Any) -> Any:
         n_actions, space = self._n_actions[agent], self.action_spaces[agent]
         if isinstance(space, spaces.Box):
-            # The bounds are the environment's affair
+            # The bounds are left to the environment, which may clip
             return np.asarray(action, dtype=space.dtype)
         try:
-            known = np.asarray(action) if n_actions is None else operator.index(action)
-            if space.contains(known) if n_actions is None else 0 <= known < n_actions:
-                return known
+            converted = np.asarray(action) if n_actions is None else operator.index(action)
+            if space.contains(converted) if n_actions is None else 0 <= converted < n_actions:
+                return converted
         except TypeError:
-            pass  # not an integer
+            # operator.index() refuses what is not an integer
+            pass
         raise ValueError(f"The action of {agent!r} is {action!r}, which is not in its space {space}.")
 
 
 class ResumableTupleEnv(GymTupleEnv):
     """
-    One whose whole state lies in a few attributes of the game, so that it can be put back to where it was.
+    ``GymTupleEnv`` whose whole state lies in a few attributes of the game, so that it can be saved and restored.
     """
 
-    #: names of these attributes
+    #: Names of these attributes
     state_names: ClassVar[tuple[str, ...]]
 
     def get_state(self) -> dict[str, Any]:
         """
-        :return: all that decides how the episode and those after it go on; it can be pickled
+        Return everything that determines the rest of this episode and the following ones.
+
+        :return: A copy that can be pickled
         """
         game = {name: getattr(self.game, name) for name in self.state_names}
-        # One copy of it all: what its parts share, they go on sharing
+        # One deepcopy of everything, so that objects that several attributes share are still shared in the copy
         return copy.deepcopy({"game": game, "steps": self._steps, "saw": self._saw, "under_way": bool(self.agents)})
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        Go on where ``get_state`` was called; given the same actions, everything that follows is the same.
+        Restore a state. With the same actions, everything that follows is then the same.
 
-        :param state: what ``get_state`` returned in an environment with the same arguments
+        :param state: State that ``get_state`` returned in an environment with the same arguments
         """
         state = copy.deepcopy(state)
+        # The reset puts everything that is not part of the state into a defined condition
         self.reset()
         for name, value in state["game"].items():
             setattr(self.game, name, value)
@@ -265,23 +291,24 @@ class ResumableTupleEnv(GymTupleEnv):
 
 def make_registered(package: str, id: str, known: Sequence[str], **env_kwargs: Any) -> gym.Env:
     """
-    Make an environment that a package has registered with Gymnasium. None of Gymnasium's wrappers is put around it: they check
-    for one agent and take time.
+    Make an environment that a package has registered with Gymnasium, without Gymnasium's wrappers.
 
-    :param package: what the message about a wrong name calls it
-    :param id: Gymnasium's id of it
-    :param known: the ids that there are
-    :param env_kwargs: override the arguments that the id stands for, ``max_episode_steps`` included
-    :return: the environment
-    :raises ValueError: for an unknown id, naming the nearest ones
+    The wrappers would cost time, and their checks assume a single agent.
+
+    :param package: Name of the package, for messages
+    :param id: Gymnasium's id of the environment
+    :param known: The ids that exist
+    :param env_kwargs: Keyword arguments that override those of the id, including ``max_episode_steps``
+    :return: The environment
+    :raises ValueError: For an unknown id. The message names the nearest ones
     """
     if id not in known:
         raise ValueError(
             f"{package} has no environment {id!r}.{nearest(id, known)} It has {len(known)}, such as {known[0]!r}."
         )
-    found = gym.spec(id)
-    creator: Any = found.entry_point if callable(found.entry_point) else load_env_creator(str(found.entry_point))
+    spec = gym.spec(id)
+    creator: Any = spec.entry_point if callable(spec.entry_point) else load_env_creator(str(spec.entry_point))
     with warnings.catch_warnings():
-        # Of no consequence, and nothing that a user could do about it
+        # Harmless, and a user can do nothing about it
         warnings.filterwarnings("ignore", message=".*precision lowered by casting")
-        return creator(**{**copy.deepcopy(found.kwargs), **env_kwargs})
+        return creator(**{**copy.deepcopy(spec.kwargs), **env_kwargs})

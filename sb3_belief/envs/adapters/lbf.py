@@ -1,4 +1,4 @@
-"""Level-Based Foraging, https://github.com/semitable/lb-foraging: ids ``lbf/<its Gymnasium id>``."""
+"""Level-Based Foraging, https://github.com/semitable/lb-foraging, with the ids ``lbf/<Gymnasium id>``."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -11,11 +11,12 @@ from sb3_belief.envs.adapters.gym_tuple import ResumableTupleEnv, make_registere
 
 class Foraging(ResumableTupleEnv):
     """
-    Players on a grid collect food; a food is collected when those next to it who load at the same step have levels that sum up
-    to its own. See ``docs/environments/lbf.md``.
+    Level-Based Foraging: players on a grid collect food. See ``docs/environments/lbf.md``.
 
-    An episode terminates when no food is left, which is its success. The package reports its step limit as an end of the same
-    kind; here it is a truncation if food is left.
+    A food is collected if the levels of the adjacent players that load it at the same step sum up to at least its own level.
+
+    An episode terminates with success when no food is left. The package reports its step limit as a termination too. Here it
+    is a truncation if food is left.
 
     The team's reward is the sum over the agents: 1 for an episode in which all food is collected.
     """
@@ -31,22 +32,24 @@ class Foraging(ResumableTupleEnv):
     )
 
     def _prepare_reset(self) -> None:
-        # The package places players and food only where nobody stood at the end of the last episode: the first
-        # observation would depend on that and not on the seed alone
+        # The package avoids the players' old positions when it places players and food, so without this the first observation
+        # would depend on the end of the last episode and not on the seed alone
         for player in self.game.players:
             player.position = None
 
     def _visible(self, observations: Sequence[np.ndarray]) -> np.ndarray:
         """
-        Those who are in the observation. Read from the positions, because with three players and more the observation's blocks
-        are packed: the k-th block is whoever is seen as the k-th.
+        Return the players that the observation shows.
+
+        They are computed from positions, because an observation of three or more players does not say which of them it shows:
+        its k-th block holds the k-th visible player, whichever that is.
         """
         sight = self.game.sight
         positions = [player.position for player in self.game.players]
         rows = []
         for viewer, (row, column) in enumerate(positions):
-            # The package counts rows and columns from the corner of what a viewer sees, at the upper and left border from that
-            # of the field, and shows who is at 0 to 2 sight there: from a border one sees up to twice as far
+            # The package shows players in the square of side 2 * sight + 1 whose upper left corner is sight rows and columns
+            # away, but moved into the field at the upper and left border. From there a player sees up to twice as far
             top, left = max(row - sight, 0), max(column - sight, 0)
             others = positions[:viewer] + positions[viewer + 1 :]
             rows.append([0 <= y - top <= 2 * sight and 0 <= x - left <= 2 * sight for y, x in others])
@@ -60,25 +63,32 @@ class Foraging(ResumableTupleEnv):
 
     def team_reward(self, rewards: dict[str, float]) -> float:
         """
-        :param rewards: what ``step`` returned
-        :return: their sum: the part of the food's levels that was collected in this step
+        Return the sum of the agents' rewards.
+
+        :param rewards: Rewards by agent, as ``step`` returned them
+        :return: Their sum, which is the fraction of all food levels that was collected in this step
         """
         return sum(rewards.values())
 
     def render(self) -> Any:
         """
-        :return: an image for ``render_mode="rgb_array"``; a window is opened for "human"
+        Return an image, or show the field in a window.
+
+        :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
         """
-        # The package's render() does not look at its own render_mode
+        # The package's render() ignores its own render_mode
         return self.game.render(mode=self.render_mode or "human")
 
 
 def make(name: str, **env_kwargs: Any) -> Foraging:
     """
-    :param name: Gymnasium's id, e.g. ``"Foraging-2s-8x8-2p-2f-coop-v3"``
-    :param env_kwargs: override the arguments that the id stands for, e.g. ``max_episode_steps`` (50), ``sight``, ``penalty``
-    :return: the environment
-    :raises ValueError: for an unknown name, or for grid observations, with which the package makes no valid space
+    Make a foraging environment.
+
+    :param name: Gymnasium's id, for instance ``"Foraging-2s-8x8-2p-2f-coop-v3"``
+    :param env_kwargs: Keyword arguments that override those of the id, for instance ``max_episode_steps`` (50), ``sight`` or
+        ``penalty``
+    :return: The environment
+    :raises ValueError: For an unknown name, or for grid observations, for which the package makes no valid space
     """
     if env_kwargs.get("grid_observation"):
         raise ValueError(
@@ -90,8 +100,10 @@ def make(name: str, **env_kwargs: Any) -> Foraging:
 
 def names() -> list[str]:
     """
-    :return: the package's ids with vector observations
+    Return the ids of the package with vector observations.
+
+    :return: Gymnasium's ids
     """
-    import lbforaging  # noqa: F401 (registers them)
+    import lbforaging  # noqa: F401 (registers the ids)
 
     return [id for id in gym.registry if id.startswith("Foraging-") and not id.startswith("Foraging-grid")]

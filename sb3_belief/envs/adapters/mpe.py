@@ -1,8 +1,8 @@
 """
-The multi-particle environments of ``mpe2`` (``mpe/simple_spread_v3``), with a radius of sight if asked for.
+The multi-particle environments of ``mpe2`` (``mpe/simple_spread_v3``), with an optional radius of sight.
 
-Rewards are as the environment gives them, own for each agent; ``simple_spread`` mixes a common one in by ``local_ratio``. An
-episode ends by truncation, at ``max_cycles``.
+Each agent gets its own reward as the environment returns it. ``simple_spread`` adds a share of a common reward, which
+``local_ratio`` determines. An episode is truncated at ``max_cycles``.
 """
 
 from collections.abc import Callable
@@ -19,24 +19,29 @@ from sb3_belief.envs.suites import unknown_name
 
 def names() -> list[str]:
     """
-    :return: what comes after ``mpe/``
+    Return the names of mpe2's environments.
+
+    :return: Names that follow ``mpe/`` in an id
     """
     return versioned_modules("mpe2", root="mpe2")
 
 
 def make(name: str, radius: float | None = None, **env_kwargs: Any) -> ParallelEnv:
     """
-    Everything is visible in most of these tasks, so by default everybody sees everybody's actions. With ``radius`` an agent
-    sees only teammates at most so far away: whoever is beyond is blanked in its observation (zeros, as mpe2 itself pads those
-    that an agent does not see) and so are the actions it is told of. Landmarks stay visible.
+    Make a multi-particle environment.
 
-    :param name: e.g. ``"simple_spread_v3"``
-    :param radius: of sight, > 0, in the units of the positions (most tasks begin within [-1, 1] x [-1, 1]). None: no limit
-    :param env_kwargs: keyword arguments of the environment. With its own ``num_agent_neighbors`` an agent is told the actions
-        of those nearest ones that it observes.
-    :return: the parallel environment; by itself it does not look whether actions are within their spaces
-    :raises ValueError: for an unknown name, a radius that is not positive, or one for a task whose observations cannot be
-        blanked
+    In most of these tasks everything is visible, so by default every agent sees the actions of all others. With ``radius`` an
+    agent sees only teammates within that distance. All others are set to zero in its observation, as mpe2 itself does for
+    agents that are not observed, and their actions are not visible to it. Landmarks stay visible.
+
+    :param name: Name of the environment, for instance ``"simple_spread_v3"``
+    :param radius: Radius of sight, > 0, in the units of the positions (most tasks start within [-1, 1] x [-1, 1]). None for no
+        limit
+    :param env_kwargs: Keyword arguments of the environment. With mpe2's own ``num_agent_neighbors`` an agent sees the actions
+        of those nearest agents that it observes
+    :return: The parallel environment. It does not check whether actions lie in their spaces
+    :raises ValueError: For an unknown name, a radius that is not positive, or a radius for a task whose observations do not
+        allow one
     """
     known = names()
     if name not in known:
@@ -46,7 +51,7 @@ def make(name: str, radius: float | None = None, **env_kwargs: Any) -> ParallelE
         if not radius > 0:
             raise ValueError(f"radius={radius!r} must be greater than 0, or None for no limit.")
         if name not in LAYOUTS:
-            reason = _REASONS.get(name, "where its observations show teammates is not known")
+            reason = _REASONS.get(name, "it is not known where its observations show teammates")
             raise ValueError(
                 f"'mpe/{name}' cannot have a radius: {reason}. Tasks that can: {', '.join(LAYOUTS)}. For this one, blank the"
                 " observations in a wrapper of your own that has a method visibility() too."
@@ -57,73 +62,81 @@ def make(name: str, radius: float | None = None, **env_kwargs: Any) -> ParallelE
     if env_kwargs.get("continuous_actions", False):
         env: ParallelEnv = module.parallel_env(**env_kwargs)
     else:
-        # Without mpe2's wrappers that refuse wrong actions and calls in the wrong order, as a TeamVecEnv does itself
-        env = AllAtOnce(module.raw_env(**env_kwargs))
+        # raw_env lacks mpe2's wrappers that check actions and the order of calls, since a TeamVecEnv checks both
+        env = MpeParallelEnv(module.raw_env(**env_kwargs))
     if radius is not None:
         return WithinRadius(env, radius, LAYOUTS[name])
     return env if neighbors is None else AmongNearest(env, neighbors)
 
 
-class AllAtOnce(aec_to_parallel_wrapper):
+class MpeParallelEnv(aec_to_parallel_wrapper):
     """
-    PettingZoo's conversion, less what it asks for and throws away (all observations, before each step): with mpe2's wrappers
-    left out too, a step takes half the time. In mpe2 the last of the agents moves the world, and all end together.
+    Faster conversion of mpe2's AEC environments to parallel ones.
+
+    PettingZoo's conversion computes all observations before each agent's action and discards them. Without that, and without
+    mpe2's wrappers, a step takes half the time. It relies on two facts about mpe2: the world moves when the last agent acts,
+    and all agents end together.
     """
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: by agent
-        :return: observations, rewards, terminations, truncations and infos, by agent
+        Advance the episode by one step.
+
+        :param actions: Actions by agent
+        :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         env, agents = self.aec_env, self.aec_env.agents[:]
         for agent in agents:
             env.step(actions[agent])
         observations = {agent: env.observe(agent) for agent in agents}
         result = observations, dict(env.rewards), dict(env.terminations), dict(env.truncations), dict(env.infos)
+        # An AEC environment removes agents that have ended when they are stepped with the action None
         while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
             env.step(None)
         self.agents = env.agents
         return result
 
 
-# Where an agent's observation shows its teammates. The first argument is the world's agents, the second the viewer's number;
-# the result has the columns of each of its others, in order.
+# The entries ("columns") of an agent's observation that show its teammates, one list for each of the others in order. The
+# functions below compute them from the world and the index of the observing agent, following mpe2's source
 Columns = list[list[int]]
 
 
 def _runs(*parts: tuple[int, int], n_others: int) -> Columns:
     """
-    :param parts: (start, width) of blocks with ``width`` columns for each of the others in turn
-    :param n_others: number of others
-    :return: the columns of each of them
+    Return the columns of others that are shown in consecutive blocks.
+
+    :param parts: (start, width) of each part of the observation that has ``width`` columns for every other agent in turn
+    :param n_others: Number of other agents
+    :return: The columns of each of them
     """
     return [[start + k * width + c for start, width in parts for c in range(width)] for k in range(n_others)]
 
 
 def _spread(world: Any, viewer: int) -> Columns:
-    # own velocity 2, own position 2, landmarks 2 each | others' positions 2 each | others' messages 2 each
+    # Own velocity 2, own position 2, landmarks 2 each | others' positions 2 each | others' messages 2 each
     n_others, start = len(world.agents) - 1, 4 + 2 * len(world.landmarks)
     return _runs((start, 2), (start + 2 * n_others, world.dim_c), n_others=n_others)
 
 
 def _reference(world: Any, viewer: int) -> Columns:
-    # own velocity 2, landmarks 2 each, goal's colour 3 | the other's message
+    # Own velocity 2, landmarks 2 each, goal's colour 3 | the other's message
     return _runs((2 + 2 * len(world.landmarks) + 3, world.dim_c), n_others=len(world.agents) - 1)
 
 
 def _speaker_listener(world: Any, viewer: int) -> Columns:
-    # speaker: goal's colour. Listener: own velocity 2, landmarks 2 each | the speaker's message
+    # Speaker: goal's colour. Listener: own velocity 2, landmarks 2 each | the speaker's message
     return [[]] if viewer == 0 else _runs((2 + 2 * len(world.landmarks), world.dim_c), n_others=1)
 
 
 def _adversary(world: Any, viewer: int) -> Columns:
-    # (the good agents: goal's position 2), landmarks 2 each | others' positions 2 each
+    # Only for good agents: goal's position 2. Landmarks 2 each | others' positions 2 each
     start = 2 * len(world.landmarks) + (0 if world.agents[viewer].adversary else 2)
     return _runs((start, 2), n_others=len(world.agents) - 1)
 
 
 def _push(world: Any, viewer: int) -> Columns:
-    # adversary: own velocity 2, landmarks 2 each | others' positions. Good agent: own velocity 2, goal's position 2, own
+    # Adversary: own velocity 2, landmarks 2 each | others' positions. Good agent: own velocity 2, goal's position 2, own
     # colour 3, landmarks 2 each, their colours 3 each | others' positions
     n_landmarks = len(world.landmarks)
     start = 2 + 2 * n_landmarks if world.agents[viewer].adversary else 7 + 5 * n_landmarks
@@ -131,7 +144,7 @@ def _push(world: Any, viewer: int) -> Columns:
 
 
 def _tag(world: Any, viewer: int) -> Columns:
-    # own velocity 2, own position 2, landmarks 2 each | others' positions 2 each | the good others' velocities 2 each
+    # Own velocity 2, own position 2, landmarks 2 each | others' positions 2 each | the good others' velocities 2 each
     others = [agent for i, agent in enumerate(world.agents) if i != viewer]
     start = 4 + 2 * sum(not landmark.boundary for landmark in world.landmarks)
     columns = _runs((start, 2), n_others=len(others))
@@ -144,11 +157,11 @@ def _tag(world: Any, viewer: int) -> Columns:
 
 
 def _nobody(world: Any, viewer: int) -> Columns:
-    # no teammate is in the observation
+    # The observation shows no teammate
     return [[] for _ in world.agents[1:]]
 
 
-#: The tasks that can have a radius
+#: The tasks that allow a radius, and where their observations show teammates
 LAYOUTS: dict[str, Callable[[Any, int], Columns]] = {
     "simple_adversary_v3": _adversary,
     "simple_formation_v1": _nobody,
@@ -162,25 +175,27 @@ LAYOUTS: dict[str, Callable[[Any, int], Columns]] = {
 _REASONS = {
     "simple_v3": "it has one agent only",
     "simple_crypto_v3": "positions mean nothing in it",
-    "simple_world_comm_v3": "its forests hide agents already, and observations tell of those in them",
+    "simple_world_comm_v3": "its forests already hide agents, and observations say which agents are in them",
     "collect_treasure_v1": "it shows teammates in the order of their distance",
 }
 
 
 class WithinRadius(Adapter):
     """
-    Agents see their teammates up to a distance.
+    Wrapper that limits which teammates an agent sees to those within a radius.
 
-    :param env: the environment of mpe2
-    :param radius: the distance
-    :param layout: where observations show teammates
+    :param env: Environment of mpe2
+    :param radius: Largest distance at which a teammate is visible
+    :param layout: Function of the world and the index of an agent that returns the columns of its observation that show each
+        teammate
     """
 
     def __init__(self, env: ParallelEnv, radius: float, layout: Callable[[Any, int], Columns]):
         super().__init__(env)
         self.radius = radius
         self._world: Any = env.unwrapped.world
-        # [n, n_others, width]: the columns that show an other, by viewer; viewers' observations differ in width
+        # For each observing agent a bool array [n_others, width] of the columns that show each other agent. A list, since the
+        # widths of observations may differ
         self._shows = []
         for i, agent in enumerate(self.possible_agents):
             shows = np.zeros((len(self.possible_agents) - 1, *(env.observation_space(agent).shape or ())), dtype=bool)
@@ -190,24 +205,30 @@ class WithinRadius(Adapter):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        :param seed: of the environment, None: its generator goes on
-        :param options: handed to the environment
-        :return: observations and infos, by agent
+        Start an episode.
+
+        :param seed: Seed of the environment. With None its random generator continues
+        :param options: Passed on to the environment
+        :return: Observations and infos, by agent
         """
         obs, infos = self.env.reset(seed=seed, options=options)
         return self._blank(obs), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: by agent
-        :return: observations, rewards, terminations, truncations and infos, by agent
+        Advance the episode by one step.
+
+        :param actions: Actions by agent
+        :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
         return self._blank(obs), rewards, terminations, truncations, infos
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: bool [n_others] by agent: who is within the radius after the last step, as the observation shows it
+        Return which others are within the radius after the last step, which are those that the observation shows.
+
+        :return: {agent: bool [n_others]}
         """
         within = distances(self._world) <= self.radius
         return {agent: np.delete(within[i], i) for i, agent in enumerate(self.possible_agents)}
@@ -223,10 +244,10 @@ class WithinRadius(Adapter):
 
 class AmongNearest(Adapter):
     """
-    mpe2's own limit of sight: agents observe their nearest teammates.
+    Wrapper that adds the visibility of actions for mpe2's own limit of sight, a number of nearest agents.
 
-    :param env: the environment of mpe2, made with ``num_agent_neighbors``
-    :param n_neighbors: how many these are
+    :param env: Environment of mpe2, made with ``num_agent_neighbors``
+    :param n_neighbors: The same number
     """
 
     def __init__(self, env: ParallelEnv, n_neighbors: int):
@@ -236,13 +257,15 @@ class AmongNearest(Adapter):
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: bool [n_others] by agent: who is among its nearest after the last step, as the observation shows it
+        Return which others are among the nearest after the last step, which are those that the observation shows.
+
+        :return: {agent: bool [n_others]}
         """
         apart = distances(self._world)
         visible = {}
         for i, agent in enumerate(self.possible_agents):
             to_others = np.delete(apart[i], i)
-            # the same call as mpe2's, so that two who are equally far do not change places
+            # The same call as in mpe2, so that agents at equal distances are ordered in the same way
             visible[agent] = np.zeros(len(to_others), dtype=bool)
             visible[agent][np.argsort(to_others)[: self.n_neighbors]] = True
         return visible
@@ -250,8 +273,10 @@ class AmongNearest(Adapter):
 
 def distances(world: Any) -> np.ndarray:
     """
-    :param world: mpe2's world
-    :return: of all agents from each other, float64 [n, n]
+    Return the distances of all agents from each other.
+
+    :param world: World of mpe2
+    :return: float64 [n, n]
     """
     positions = np.array([agent.state.p_pos for agent in world.agents])
     return np.linalg.norm(positions[:, None] - positions[None], axis=-1)

@@ -19,48 +19,57 @@ _GROUPS = ("atari", "butterfly", "classic", "sisl")
 
 def names() -> list[str]:
     """
-    :return: what comes after ``pettingzoo/``: ``<group>.<module>``; what a module needs may still be missing
+    Return the names of PettingZoo's environments, including those whose own requirements are not installed.
+
+    :return: Names ``<group>.<module>`` that follow ``pettingzoo/`` in an id
     """
     return versioned_modules(*(f"pettingzoo.{group}" for group in _GROUPS), root="pettingzoo")
 
 
 def versioned_modules(*packages: str, root: str) -> list[str]:
     """
-    :param packages: names of packages
-    :param root: package that the names are to be relative to
-    :return: names of their modules that end in a version, as those of the environments do; none of them is imported
+    Return the modules of packages whose names end in a version, as those of environments do, without importing them.
+
+    :param packages: Names of packages
+    :param root: Package that the returned names are relative to
+    :return: Sorted names of modules
     """
-    found = []
+    modules = []
     for package in packages:
         spec = find_spec(package)
         locations = [] if spec is None else list(spec.submodule_search_locations or [])
         for module in pkgutil.iter_modules(locations, f"{package}."):
             if module.name.rpartition("_v")[2].isdecimal():
-                found.append(module.name.removeprefix(f"{root}."))
-    return sorted(found)
+                modules.append(module.name.removeprefix(f"{root}."))
+    return sorted(modules)
 
 
 def make(name: str, **env_kwargs: Any) -> ParallelEnv:
     """
-    :param name: ``<group>.<module>``, e.g. ``"sisl.pursuit_v5"``
-    :param env_kwargs: keyword arguments of the environment
-    :return: its parallel environment; one that has none is converted by ``to_parallel``. Everybody sees everybody's actions,
-        except in ``sisl.pursuit``, where a pursuer sees those in its window.
-    :raises ValueError: for an unknown name
-    :raises ModuleNotFoundError: if what the environment needs is not installed, with the line that installs it
+    Make an environment of PettingZoo.
+
+    Every agent sees the actions of all others, except in ``sisl.pursuit``, where a pursuer sees those in its window.
+
+    :param name: ``<group>.<module>``, for instance ``"sisl.pursuit_v5"``
+    :param env_kwargs: Keyword arguments of the environment
+    :return: The parallel environment. An AEC environment is converted by ``to_parallel``
+    :raises ValueError: For an unknown name
+    :raises ModuleNotFoundError: If a package that the environment needs is not installed. The message has the line that
+        installs it
     """
     known = names()
     if name not in known:
         raise unknown_name("pettingzoo", name, known)
     try:
         with warnings.catch_warnings():
-            # They are meant for those who import the module themselves
+            # PettingZoo advises users who import the module themselves to call its make function
             warnings.simplefilter("ignore", DeprecationWarning)
             module = import_module(f"pettingzoo.{name}")
     except ImportError as error:
         group = name.partition(".")[0]
         raise ModuleNotFoundError(
-            f"'pettingzoo/{name}' needs what is not installed ({error}): pip install 'pettingzoo[{group}]'.", name=error.name
+            f"'pettingzoo/{name}' needs a package that is not installed ({error}): pip install 'pettingzoo[{group}]'.",
+            name=error.name,
         ) from error
     env = to_parallel((module.parallel_env if hasattr(module, "parallel_env") else module.env)(**env_kwargs))
     return Pursuit(env) if name.startswith("sisl.pursuit_v") else env
@@ -68,16 +77,17 @@ def make(name: str, **env_kwargs: Any) -> ParallelEnv:
 
 def to_parallel(env: AECEnv | ParallelEnv) -> ParallelEnv:
     """
-    Make a PettingZoo environment one that a team can play, with PettingZoo's own conversions:
+    Convert a PettingZoo environment to one that a team can play, with PettingZoo's own conversions.
 
-    - an AEC environment that says ``is_parallelizable`` by ``aec_to_parallel``, one whose agents take turns by
-      ``turn_based_aec_to_parallel``: then all act at each step but only the action of the one on turn counts, the others see
-      that one and can do nothing but action 0
-    - observations ``{"observation": ..., "action_mask": ...}``, PettingZoo's convention, are split: masks go to the infos
+    - An AEC environment with ``is_parallelizable`` in its metadata is converted by ``aec_to_parallel``.
+    - Any other AEC environment is turn-based and converted by ``turn_based_aec_to_parallel``. All agents act at each step, but
+      only the action of the agent whose turn it is counts. The others see that action and can only choose action 0.
+    - Observations of the form ``{"observation": ..., "action_mask": ...}``, PettingZoo's convention, are split, and the masks
+      are moved to the infos.
 
-    :param env: the environment, AEC or parallel
-    :return: the parallel environment
-    :raises TypeError: if it is neither
+    :param env: The environment, AEC or parallel
+    :return: The parallel environment
+    :raises TypeError: If it is neither
     """
     if isinstance(env, AECEnv):
         if env.metadata.get("is_parallelizable", False):
@@ -92,10 +102,12 @@ def to_parallel(env: AECEnv | ParallelEnv) -> ParallelEnv:
 
 class Adapter(BaseParallelWrapper):
     """
-    A wrapper that stays ``unwrapped``: what it offers beyond PettingZoo's interface is found there even behind conversions to
-    AEC and back, which some wrappers of SuperSuit consist of.
+    Wrapper that returns itself as ``unwrapped``.
 
-    :param env: the environment
+    Some wrappers of SuperSuit convert an environment to AEC and back, and only ``unwrapped`` passes through these conversions.
+    What the adapter offers beyond PettingZoo's interface is therefore still found there.
+
+    :param env: The environment
     """
 
     def __init__(self, env: ParallelEnv):
@@ -106,20 +118,17 @@ class Adapter(BaseParallelWrapper):
 
     @property
     def unwrapped(self) -> ParallelEnv:
-        """
-        :return: this wrapper
-        """
+        """This wrapper."""
         return self
 
     @property
     def agents(self) -> list[str]:
-        """
-        :return: who is in play
-        """
+        """The agents that are in play."""
         return self.env.agents
 
     def __getattr__(self, name: str) -> Any:
-        # Private names are left alone so that pickle and copy work; PettingZoo's conversions pass nothing on
+        # PettingZoo's conversions do not pass on attributes, so these are looked up behind them. Private names are excluded so
+        # that pickle and copy work
         if name.startswith("_") or name == "env":
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         return getattr(self.env, name) if hasattr(self.env, name) else getattr(self.env.unwrapped, name)
@@ -127,9 +136,9 @@ class Adapter(BaseParallelWrapper):
 
 class TurnBased(Adapter):
     """
-    A game of turns: all others see the action of the one on turn.
+    Turn-based game, in which all others see the action of the agent whose turn it is.
 
-    :param env: the AEC environment
+    :param env: The AEC environment
     """
 
     def __init__(self, env: AECEnv):
@@ -139,24 +148,30 @@ class TurnBased(Adapter):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        :param seed: of the game, None: its generator goes on
-        :param options: handed to the environment
-        :return: observations and infos, by agent
+        Start an episode.
+
+        :param seed: Seed of the environment. With None its random generator continues
+        :param options: Passed on to the environment
+        :return: Observations and infos, by agent
         """
         self._moved = ""
         return self.env.reset(seed=seed, options=options)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: of all agents; only that of the one on turn counts
-        :return: observations, rewards, terminations, truncations and infos, by agent
+        Advance the episode by one turn.
+
+        :param actions: Actions of all agents. Only that of the agent whose turn it is counts
+        :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         self._moved = self._aec.agent_selection
         return self.env.step(actions)
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: bool [n_others] by agent: who was on turn in the last step, since nobody else did anything
+        Return which other agent had its turn in the last step, since no other agent's action counted.
+
+        :return: {agent: bool [n_others]}
         """
         return {
             agent: np.array([other == self._moved for other in self.possible_agents if other != agent], dtype=bool)
@@ -166,10 +181,12 @@ class TurnBased(Adapter):
 
 class SplitMasks(Adapter):
     """
-    Splits observations ``{"observation": ..., "action_mask": ...}``: the masks go to the infos. A mask that allows nothing, as
-    those have who are not on turn, allows action 0, since a model cannot but act.
+    Wrapper that moves the masks of observations ``{"observation": ..., "action_mask": ...}`` to the infos.
 
-    :param env: the environment; agents whose observations are of another kind are left as they are
+    A mask that allows no action, as for an agent whose turn it is not, is changed to allow action 0, since a model must always
+    choose one.
+
+    :param env: The environment. Observations of another form are left unchanged
     """
 
     def __init__(self, env: ParallelEnv):
@@ -178,24 +195,30 @@ class SplitMasks(Adapter):
 
     def observation_space(self, agent: str) -> spaces.Space:
         """
-        :param agent: its name
-        :return: the space of its observation without the mask
+        Return the observation space of an agent.
+
+        :param agent: Name of the agent
+        :return: Space of its observations without the mask
         """
         space: Any = self.env.observation_space(agent)
         return space["observation"] if agent in self._masked else space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        :param seed: of the environment, None: its generator goes on
-        :param options: handed to the environment
-        :return: observations and infos, by agent
+        Start an episode.
+
+        :param seed: Seed of the environment. With None its random generator continues
+        :param options: Passed on to the environment
+        :return: Observations and infos, by agent
         """
         return self._split(*self.env.reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: by agent
-        :return: observations, rewards, terminations, truncations and infos, by agent
+        Advance the episode by one step.
+
+        :param actions: Actions by agent
+        :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
         obs, infos = self._split(obs, infos)
@@ -213,14 +236,18 @@ class SplitMasks(Adapter):
 
 class Pursuit(Adapter):
     """
-    SISL's pursuit: a pursuer sees what those in its window do (``obs_range``, 7x7 cells by default, itself in the middle).
+    SISL's pursuit, in which a pursuer sees the actions of the pursuers in its window.
 
-    :param env: the parallel environment
+    The window has ``obs_range`` x ``obs_range`` cells, 7x7 by default, with the pursuer in the middle.
+
+    :param env: The parallel environment
     """
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: bool [n_others] by agent: who was in its window after the last step
+        Return which other pursuers were in the window after the last step.
+
+        :return: {agent: bool [n_others]}
         """
         game = self.env.unwrapped.env
         cells = np.array([game.pursuer_layer.get_position(i) for i in range(len(self.possible_agents))])

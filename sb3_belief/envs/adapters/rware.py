@@ -1,4 +1,4 @@
-"""The Multi-Robot Warehouse, https://github.com/semitable/robotic-warehouse: ids ``rware/<its Gymnasium id>``."""
+"""The Multi-Robot Warehouse, https://github.com/semitable/robotic-warehouse, with the ids ``rware/<Gymnasium id>``."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -11,13 +11,13 @@ from sb3_belief.envs.adapters.gym_tuple import ResumableTupleEnv, make_registere
 
 class Warehouse(ResumableTupleEnv):
     """
-    Robots bring requested shelves to the goals and others back. See ``docs/environments/rware.md``.
+    Multi-Robot Warehouse: robots carry requested shelves to the goals and return them. See ``docs/environments/rware.md``.
 
-    Nothing ends an episode but its limits, ``max_steps`` (500) and, if set, ``max_inactivity_steps``. The package reports them
-    as terminations; here they are truncations.
+    An episode ends only at its limits, ``max_steps`` (500) and, if set, ``max_inactivity_steps``. The package reports them as
+    terminations. Here they are truncations.
 
-    The team's reward is the sum over the agents, i.e. the number of shelves delivered; with the reward type "global", which
-    gives every delivery to everyone, it is their mean, for the same number.
+    The team's reward is the sum over the agents. With the reward type "global", which rewards every agent for each delivery,
+    it is their mean. Either way it counts the delivered shelves.
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
@@ -31,7 +31,7 @@ class Warehouse(ResumableTupleEnv):
     )
 
     def _visible(self, observations: Sequence[np.ndarray]) -> np.ndarray:
-        """Those in the window that a robot's sensors show, the cells at most ``sensor_range`` rows and columns away."""
+        """Return the robots that a robot's sensors show, those at most ``sensor_range`` rows and columns away."""
         robots, reach = self.game.agents, self.game.sensor_range
         rows = [
             [max(abs(robot.x - viewer.x), abs(robot.y - viewer.y)) <= reach for robot in robots if robot is not viewer]
@@ -44,32 +44,38 @@ class Warehouse(ResumableTupleEnv):
 
     def team_reward(self, rewards: dict[str, float]) -> float:
         """
-        :param rewards: what ``step`` returned
-        :return: their sum, or their mean with the reward type "global"
+        Return the reward for the deliveries of the team.
+
+        :param rewards: Rewards by agent, as ``step`` returned them
+        :return: Their sum, or their mean with the reward type "global"
         """
         total = sum(rewards.values())
         return total / len(rewards) if self.game.reward_type.name == "GLOBAL" else total
 
     def render(self) -> Any:
         """
-        :return: an image for ``render_mode="rgb_array"``; a window is opened for "human"
+        Return an image, or show the warehouse in a window.
+
+        :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
         """
-        # The package's render() does not look at its own render_mode
+        # The package's render() ignores its own render_mode
         return self.game.render(mode=self.render_mode or "human")
 
 
 def make(name: str, **env_kwargs: Any) -> Warehouse:
     """
-    :param name: Gymnasium's id, e.g. ``"rware-tiny-2ag-v2"``
-    :param env_kwargs: override the arguments that the id stands for, e.g. ``max_steps`` (500), ``sensor_range`` (1);
-        ``reward_type`` may be "global", "individual" or "two_stage", ``observation_type`` "flattened" or "image"
-    :return: the environment
-    :raises ValueError: for an unknown name, reward type or observation type
+    Make a warehouse environment.
+
+    :param name: Gymnasium's id, for instance ``"rware-tiny-2ag-v2"``
+    :param env_kwargs: Keyword arguments that override those of the id, for instance ``max_steps`` (500) or ``sensor_range``
+        (1). ``reward_type`` may be "global", "individual" or "two_stage", and ``observation_type`` "flattened" or "image"
+    :return: The environment
+    :raises ValueError: For an unknown name, reward type or observation type
     """
     known = names()
     from rware.warehouse import ObservationType, RewardType
 
-    # The package wants members of its enumerations, which a settings file cannot name
+    # The package expects members of its enumerations, which a YAML file cannot contain, so their names are accepted too
     for argument, options in (("reward_type", RewardType), ("observation_type", ObservationType)):
         value = env_kwargs.get(argument)
         if isinstance(value, str):
@@ -83,8 +89,10 @@ def make(name: str, **env_kwargs: Any) -> Warehouse:
 
 def names() -> list[str]:
     """
-    :return: the package's ids
+    Return the ids of the package.
+
+    :return: Gymnasium's ids
     """
-    import rware  # noqa: F401 (registers them)
+    import rware  # noqa: F401 (registers the ids)
 
     return [id for id in gym.registry if id.startswith("rware")]

@@ -1,4 +1,4 @@
-"""SMACv2 (Ellis et al. 2022, https://arxiv.org/abs/2212.07489): ids ``smacv2/<race>_<allies>_vs_<enemies>``."""
+"""SMACv2 (Ellis et al. 2022, https://arxiv.org/abs/2212.07489), with the ids ``smacv2/<race>_<allies>_vs_<enemies>``."""
 
 import random
 import re
@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.envs.adapters.smac_env import StarCraft, checked
+from sb3_belief.envs.adapters.smac_env import StarCraft, starcraft_kwargs
 
-# What the package's published configurations have in common
+# Arguments that all published configurations of the package share
 _PUBLISHED: dict[str, Any] = {"obs_own_pos": True, "use_unit_ranges": True, "min_attack_range": 2}
 _SIZES = ("5_vs_5", "10_vs_10", "20_vs_20", "10_vs_11", "20_vs_23")
 _TEAMS: dict[str, dict[str, Any]] = {
@@ -32,13 +32,25 @@ _SCENARIO = re.compile(r"(protoss|terran|zerg)_([1-9]\d*)_vs_([1-9]\d*)")
 
 class StarCraftV2(StarCraft):
     """
-    :class:`~sb3_belief.envs.adapters.smac_env.StarCraft` with random generators of its own: SMACv2 draws from those of the
-    process. Not seeded is what its ``attack`` capability draws, which no published scenario has.
+    Battle of SMACv2, a :class:`~sb3_belief.envs.adapters.smac_env.StarCraft` with random generators of its own.
+
+    SMACv2 draws from the global generators of ``random`` and ``numpy.random``. Their states are replaced during each reset and
+    step, so that a seed determines the result and the caller's generators are unaffected. The draws of the package's
+    ``attack`` capability, which no published scenario has, are not seeded.
     """
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """
+        Start a battle.
+
+        :param seed: Seed of the package's random generators, with which StarCraft II is launched again too. With None both
+            continue
+        :param options: Not used
+        :return: Observations and infos, by agent
+        :raises RuntimeError: If StarCraft II repeatedly loses its connection
+        """
         if seed is not None or not hasattr(self, "_python"):
             source = np.random.SeedSequence(seed)
             self._python = random.Random(int(source.generate_state(1)[0])).getstate()
@@ -49,6 +61,13 @@ class StarCraftV2(StarCraft):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """
+        Advance the battle by one step.
+
+        :param actions: Action of every agent, including dead ones
+        :return: Observations, rewards, terminations, truncations and infos, by agent
+        :raises ValueError: If an agent's action is missing, outside its space or impossible now, or if no episode is under way
+        """
         with self._own_generators():
             return super().step(actions)
 
@@ -67,13 +86,15 @@ class StarCraftV2(StarCraft):
 
 def make(name: str, render_mode: str | None = None, **env_kwargs: Any) -> StarCraftV2:
     """
-    :param name: a scenario such as ``"terran_5_vs_5"`` (any numbers of units; ``names()`` are the published ones), or a map of
-        the package such as ``"10gen_terran"`` together with ``capability_config``
+    Make a battle.
+
+    :param name: A scenario such as ``"terran_5_vs_5"`` (with any numbers of units, ``names()`` lists the published ones), or a
+        map of the package such as ``"10gen_terran"`` together with ``capability_config``
     :param render_mode: None, ``"human"`` or ``"rgb_array"``
-    :param env_kwargs: arguments of the package's ``StarCraftCapabilityEnvWrapper`` except ``map_name``, ``seed`` and
-        ``continuing_episode``; they override what the scenario stands for
-    :return: one battle
-    :raises ValueError: for an unknown name or an argument that cannot be
+    :param env_kwargs: Arguments of the package's ``StarCraftCapabilityEnvWrapper`` except ``map_name``, ``seed`` and
+        ``continuing_episode``. They override those of the scenario
+    :return: The environment
+    :raises ValueError: For an unknown name or an argument that is not allowed
     """
     from smacv2.env.starcraft2.wrapper import StarCraftCapabilityEnvWrapper
 
@@ -84,11 +105,11 @@ def make(name: str, render_mode: str | None = None, **env_kwargs: Any) -> StarCr
             " capability_config."
         )
     if kwargs.get("obs_starcraft") is False:
-        raise ValueError("obs_starcraft=False leaves nothing of the battle in the observations, nor who sees whom.")
-    kwargs = checked(f"smacv2/{name}", kwargs)
+        raise ValueError("obs_starcraft=False removes the battle from the observations, and with it which allies are in view.")
+    kwargs = starcraft_kwargs(f"smacv2/{name}", kwargs)
 
     def launch(seed: int | None) -> Any:
-        # Copies, because the package writes into the configuration
+        # A copy, because the package writes into the configuration
         game = StarCraftCapabilityEnvWrapper(seed=seed, **deepcopy(kwargs))
         if seed is not None:
             _seed_distributions(game.env_key_to_distribution_map, np.random.SeedSequence(seed))
@@ -99,9 +120,11 @@ def make(name: str, render_mode: str | None = None, **env_kwargs: Any) -> StarCr
 
 def scenario(name: str) -> dict[str, Any]:
     """
-    :param name: e.g. ``"zerg_10_vs_11"``
-    :return: the arguments of the package's environment that it stands for, those of the published configurations
-    :raises ValueError: for another name
+    Return the arguments of the package's environment for a scenario, as in the published configurations.
+
+    :param name: Name of the scenario, for instance ``"zerg_10_vs_11"``
+    :return: Keyword arguments
+    :raises ValueError: For any other name
     """
     match = _SCENARIO.fullmatch(name)
     if match is None:
@@ -121,17 +144,19 @@ def scenario(name: str) -> dict[str, Any]:
 
 def names() -> list[str]:
     """
-    :return: the published scenarios
+    Return the published scenarios.
+
+    :return: Names of scenarios
     """
     return [f"{race}_{size}" for size in _SIZES for race in _TEAMS]
 
 
 def _seed_distributions(distributions: dict[str, Any], source: np.random.SeedSequence) -> None:
     """
-    Give the generators of teams and positions, which start from the system's entropy, a seed.
+    Seed the generators of teams and positions, which the package seeds from the operating system.
 
-    :param distributions: the package's; some have others inside
-    :param source: of the seeds
+    :param distributions: The package's distributions by name. Some contain further ones
+    :param source: Source of the seeds
     """
     for name in sorted(distributions):
         distribution = distributions[name]

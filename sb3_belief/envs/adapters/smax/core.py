@@ -1,23 +1,23 @@
-"""Battles of SMAX with numpy arrays outside: what the single environment and the batch of copies have in common."""
+"""Battles of SMAX with numpy arrays as inputs and outputs, for the single environment and the vectorised one."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_belief.envs.adapters.smax.program import BattleConfig, View, battle_program
+from sb3_belief.envs.adapters.smax.program import BattleConfig, BattleView, battle_program
 
 
 class BattleStep(NamedTuple):
     """
-    A step of n copies with A agents.
+    Result of one step of n copies with A agents.
 
-    :param rewards: the team's, float32 [n]
-    :param ended: bool [n]
-    :param won: bool [n]
-    :param cut: ended by the step limit, bool [n]
-    :param active: who was alive when it acted, bool [n, A]
-    :param visible: whose action of this step each agent could observe, bool [n, A, A-1]
+    :param rewards: Team rewards, float32 [n]
+    :param ended: Whether the battle has ended, bool [n]
+    :param won: Whether it was won, bool [n]
+    :param cut: Whether it ended by the step limit, bool [n]
+    :param active: Whether each agent was alive when it acted, bool [n, A]
+    :param visible: Whose action of this step each agent could observe, bool [n, A, A-1]
     """
 
     rewards: np.ndarray
@@ -30,22 +30,23 @@ class BattleStep(NamedTuple):
 
 class Battles:
     """
-    ``n_copies`` battles with one random generator each, so that a copy's life depends on its own seed alone.
+    ``n_copies`` independent battles that are stepped together.
 
-    ``observations`` float32 [A, n, width] and ``masks`` bool [A, n, k] are those of the next action.
+    Each copy has a random generator of its own, so what happens in it depends on its own seed and actions alone. The
+    attributes ``observations``, float32 [A, n, width], and ``masks``, bool [A, n, k], are those for the next action.
 
-    :param n_copies: number of copies, at least 1
-    :param config: the rules
+    :param n_copies: Number of environment copies, at least 1
+    :param config: The rules
     """
 
     def __init__(self, n_copies: int, config: BattleConfig):
         self.n_copies, self.config = n_copies, config
         self._program = battle_program(config)
         self.agents, self.stop = self._program.agents, self._program.stop
-        self.n_actions, self.width, self.look = self._program.n_actions, self._program.width, self._program.look
+        self.n_actions, self.width, self.drawing = self._program.n_actions, self._program.width, self._program.drawing
         self._keys: Any = np.random.SeedSequence().generate_state(2 * n_copies).reshape(n_copies, 2)
         self._states: Any = None
-        # Who asks before the first reset learns that nothing can be done
+        # Before the first reset only "stop" is possible
         n_agents = len(self.agents)
         self.observations = np.zeros((n_agents, n_copies, self.width), dtype=np.float32)
         self.masks = np.zeros((n_agents, n_copies, self.n_actions), dtype=bool)
@@ -54,27 +55,33 @@ class Battles:
 
     def seed(self, copy: int, seed: int) -> None:
         """
-        :param copy: whose random generator is restarted
-        :param seed: not negative
+        Seed the random generator of one copy. The seed takes effect at its next reset.
+
+        :param copy: Index of the copy
+        :param seed: Seed, >= 0
         """
         keys = np.array(self._keys)
-        # jax.random.PRNGKey(seed), which does not take seeds above 2**31 without 64-bit arrays
+        # The same as jax.random.PRNGKey(seed), which does not accept seeds of 2**31 and more without 64-bit arrays
         keys[copy] = seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF
         self._keys = keys
 
     def reset(self, copies: np.ndarray | None = None) -> None:
         """
-        :param copies: indices of the copies in which a new battle begins; None: all
+        Start new battles.
+
+        :param copies: Indices of the copies to reset, int [k]. None for all
         """
         if copies is None:
             self._keys, self._states, view = self._program.begin(self._keys)
-            self._look(view)
+            self._set_view(view)
             return
+        # A battle begins in every copy, and the results of the others are dropped, random generators included. A compiled
+        # function has fixed shapes, so one for k copies would have to be compiled for each k
         chosen = np.zeros(self.n_copies, dtype=bool)
         chosen[copies] = True
         new_keys, new_states, view = self._program.begin(self._keys)
         self._keys, self._states = self._program.choose(chosen, (new_keys, new_states), (self._keys, self._states))
-        # New arrays, because a model may have kept the others
+        # New arrays, because a model may have kept the old ones
         self.observations, self.masks = self.observations.copy(), self.masks.copy()
         self.observations[:, copies] = np.asarray(view.observations)[:, copies]
         self.masks[:, copies] = np.asarray(view.masks)[:, copies]
@@ -83,36 +90,42 @@ class Battles:
 
     def step(self, actions: np.ndarray) -> BattleStep:
         """
-        What the masks forbid is not sent to SMAX: such an agent stops. So do the dead, whatever they choose.
+        Advance all copies by one step. No copy is reset.
+
+        An action that the mask forbids is replaced by "stop". That includes all other actions of dead agents.
 
         :param actions: int [n, A], each in 0 .. n_actions-1
-        :return: what happened; no battle is reset
+        :return: Rewards and events of the step
         """
         possible = np.take_along_axis(self.masks, actions.T[:, :, None], axis=2)[:, :, 0].T
         legal = np.where(possible, actions, self.stop).astype(np.int32)
         active = self._alive
         self._keys, self._states, view, outcome = self._program.advance(self._keys, self._states, legal)
-        self._look(view)
+        self._set_view(view)
         rewards, ended, won, cut = (np.array(values) for values in outcome)
         return BattleStep(rewards, ended, won, cut, active, np.array(view.visible))
 
-    def _look(self, view: View) -> None:
-        # One copy: what comes from jax is read-only, which PyTorch does not take
+    def _set_view(self, view: BattleView) -> None:
+        # Copies, because arrays from jax are read-only, which PyTorch does not support
         self.observations, self.masks = np.array(view.observations), np.array(view.masks)
         self._alive = np.array(view.alive)
 
     def units(self, copy: int) -> dict[str, np.ndarray]:
         """
-        :param copy: which battle
-        :return: of all units, the allies first: positions [m, 2], types [m], health [m] and alive [m]
+        Return the units of one copy, for rendering.
+
+        :param copy: Index of the copy
+        :return: ``positions`` [m, 2], ``types`` [m], ``health`` [m] and ``alive`` [m] of all units, the allies first
         """
         units = self._states.state
         return {name: np.array(getattr(units, f"unit_{name}")[copy]) for name in ("positions", "types", "health", "alive")}
 
     def get_states(self) -> list[dict[str, Any]]:
         """
-        :return: for each copy all that decides how it goes on
-        :raises ValueError: before the first ``reset``
+        Return everything that determines the following steps of each copy.
+
+        :return: One state for each copy
+        :raises ValueError: Before the first ``reset``
         """
         if self._states is None:
             raise ValueError("There is no state before the first reset().")
@@ -132,8 +145,10 @@ class Battles:
 
     def set_states(self, states: Sequence[dict[str, Any]]) -> None:
         """
-        :param states: one for each copy, as ``get_states`` returned them
-        :raises ValueError: if the number of copies or the map differs
+        Restore the states of all copies.
+
+        :param states: One state for each copy, as ``get_states`` returned them
+        :raises ValueError: If the number of copies or the map differs
         """
         if len(states) != self.n_copies:
             raise ValueError(f"Got the states of {len(states)} copies for {self.n_copies}.")
@@ -146,7 +161,7 @@ class Battles:
         self.masks = np.stack([state["masks"] for state in states], axis=1)
         self._alive = np.stack([state["alive"] for state in states])
 
-    # Compiled functions cannot be copied or pickled, but they are the same for all with these rules
+    # Compiled functions can be neither copied nor pickled, but the rules determine them, so a copy gets them from its config
 
     def __getstate__(self) -> dict[str, Any]:
         states = None if self._states is None else self.get_states()

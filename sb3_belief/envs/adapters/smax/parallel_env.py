@@ -15,25 +15,26 @@ RENDER_MODES = ("rgb_array",)
 
 class Smax(BattleGame[np.ndarray]):
     """
-    One battle of allies, the agents, against SMAX's scripted enemies.
+    Battle of a team of allies, which are the agents, against SMAX's scripted enemies.
 
     **Actions**, ``Discrete(5 + enemies)``: four directions, 4 stop, then attack enemy 0, 1, ... The mask in
-    ``infos[agent]["action_mask"]`` says what is possible next; what it forbids is carried out as "stop". The dead may only
-    stop and stay among ``agents``, inactive, until the battle ends.
+    ``infos[agent]["action_mask"]`` says which actions are possible next. Any other is carried out as "stop". Dead agents may
+    only stop. They stay in ``agents`` and are inactive until the battle ends.
 
-    **Reward**: the team's, the same for all, also for the dead. So a death ends nobody's return (no ``life_end`` before the
-    end), and an agent's sacrifice is rewarded by what the others make of it.
+    **Reward**: the team's reward, which all agents get, dead ones too. A death therefore does not end an agent's return (there
+    is no ``life_end`` before the end), and a sacrifice is rewarded by what the others achieve with it.
 
-    **End**: terminated when one side is dead, ``is_success`` if that is the enemies alone; truncated by the step limit.
+    **End**: terminated when one side is dead, with ``is_success`` if only the enemies are. Truncated by the step limit.
 
-    **Visibility**: j is visible to i if, after the step, both are alive and j is nearer than the sight range of i's type.
+    **Visibility**: j is visible to i if, after the step, both are alive and j is closer than the sight range of i's type.
 
-    :param map_name: one of ``names()``
-    :param observe_last_actions: leave the last actions of allies in view in the observation. Off by default: what
-        teammates do reaches a learner through ``others_actions``, otherwise one without a belief gets it for nothing.
+    :param map_name: One of ``names()``
+    :param observe_last_actions: Whether observations contain the last actions of the allies in view. Off by default, because a
+        learner gets the actions of others through ``others_actions``. In the observation, a learner without a belief would
+        have them too
     :param render_mode: None or ``"rgb_array"``
-    :param options: what to change of SMAX, see :data:`~sb3_belief.envs.adapters.smax.program.OPTIONS`
-    :raises ValueError: for an unknown map, option or render mode
+    :param options: Settings of SMAX to change, see :data:`~sb3_belief.envs.adapters.smax.program.OPTIONS`
+    :raises ValueError: For an unknown map, option or render mode
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -60,9 +61,11 @@ class Smax(BattleGame[np.ndarray]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """
-        :param seed: restarts the random generator; None: it goes on
-        :param options: not used
-        :return: observations and infos, by agent
+        Start a battle.
+
+        :param seed: Seed of the random generator. With None the generator continues
+        :param options: Not used
+        :return: Observations and infos, by agent
         """
         if seed is not None:
             self.battles.seed(0, seed)
@@ -76,9 +79,11 @@ class Smax(BattleGame[np.ndarray]):
         self, actions: dict[str, int]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """
-        :param actions: one for every agent, also for the dead
-        :return: observations, rewards, terminations, truncations and infos, by agent
-        :raises ValueError: if an agent's action is missing or outside its space, or if no episode is under way
+        Advance the battle by one step.
+
+        :param actions: Action of every agent, including dead ones
+        :return: Observations, rewards, terminations, truncations and infos, by agent
+        :raises ValueError: If an agent's action is missing or outside its space, or if no episode is under way
         """
         self._require_episode()
         result = self.battles.step(np.array([[self._checked_action(agent, actions) for agent in self.possible_agents]]))
@@ -103,23 +108,26 @@ class Smax(BattleGame[np.ndarray]):
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
-        :return: whose action of the last step each agent could observe, {agent: bool [n_others]}, the others in the order of
-            ``possible_agents``; all False after ``reset``
+        Return whose action of the last step each agent could observe.
+
+        :return: {agent: bool [n_others]}, the others in the order of ``possible_agents``. All False after ``reset``
         """
         return dict(zip(self.possible_agents, self._visible, strict=True))
 
     def get_state(self) -> dict[str, Any]:
         """
-        :return: all that decides how the episode and those after it go on, as arrays and plain data
+        Return everything that determines the rest of this episode and the following ones.
+
+        :return: Arrays and plain data
         """
         return {"battle": self.battles.get_states()[0], "visible": self._visible.copy(), "under_way": bool(self.agents)}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        Go on where ``get_state`` was called.
+        Restore a state.
 
-        :param state: what ``get_state`` returned in an environment of the same map
-        :raises ValueError: if it was another map
+        :param state: State that ``get_state`` returned in an environment of the same map
+        :raises ValueError: If it is the state of another map
         """
         self.battles.set_states([state["battle"]])
         self._visible = np.array(state["visible"], dtype=bool)
@@ -127,14 +135,16 @@ class Smax(BattleGame[np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """
-        :return: a picture of the battlefield, uint8 [height, width, 3]
-        :raises ValueError: if the environment was made without a render mode
+        Return a picture of the battlefield.
+
+        :return: uint8 [height, width, 3]
+        :raises ValueError: If the environment was made without a render mode
         """
         require_render_mode(self.render_mode, RENDER_MODES)
         return draw(self.battles, 0)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, since no window is open."""
 
     def _observe(self) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, self.battles.observations[:, 0], strict=True))
@@ -142,8 +152,10 @@ class Smax(BattleGame[np.ndarray]):
 
 def observation_space(battles: Battles) -> spaces.Box:
     """
-    :param battles: copies of a battle
-    :return: the space of each agent's observation
+    Return a new observation space of one agent.
+
+    :param battles: Copies of a battle
+    :return: Unbounded box, float32 [width]
     """
-    # Nearly all values are in [-1, 1]; who is pushed over the border of the map has a position just outside
+    # Nearly all values are in [-1, 1], but a unit that is pushed over the border of the map has a position just outside
     return spaces.Box(-np.inf, np.inf, (battles.width,), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""SMAX as compiled functions over all copies of a battle."""
+"""SMAX as compiled JAX functions over all copies of a battle."""
 
 import io
 import sys
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, NamedTuple
 
-# What a user may choose of SMAX; the rest is given by the map, or would change what an observation or an action is
+# The settings of SMAX that a user may change. The map determines the others, or they would change the meaning of observations
+# or actions
 OPTIONS = (
     "enemy_shoots",
     "attack_mode",
@@ -29,10 +30,11 @@ class BattleConfig:
     """
     The rules of a battle.
 
-    :param map_name: one of ``map_names()``
-    :param observe_last_actions: leave the allies' last actions in the observations
-    :param options: (name, value) of what is changed of SMAX, see ``OPTIONS``
-    :raises ValueError: for an unknown map or option
+    :param map_name: One of ``map_names()``
+    :param observe_last_actions: Whether observations contain the allies' last actions
+    :param options: (name, value) of the settings of SMAX that are changed, see ``OPTIONS``. A sorted tuple, so that equal
+        rules have equal hashes
+    :raises ValueError: For an unknown map or option
     """
 
     map_name: str
@@ -42,11 +44,13 @@ class BattleConfig:
     @classmethod
     def of(cls, map_name: str, observe_last_actions: bool, options: Mapping[str, Any]) -> "BattleConfig":
         """
-        :param map_name: one of ``map_names()``
-        :param observe_last_actions: leave the allies' last actions in the observations
-        :param options: what is changed of SMAX
-        :return: the rules
-        :raises ValueError: for an unknown map or option
+        Return the rules for arguments of an environment.
+
+        :param map_name: One of ``map_names()``
+        :param observe_last_actions: Whether observations contain the allies' last actions
+        :param options: Settings of SMAX to change
+        :return: The rules
+        :raises ValueError: For an unknown map or option
         """
         return cls(map_name, observe_last_actions, tuple(sorted(options.items())))
 
@@ -61,18 +65,19 @@ class BattleConfig:
                 f" 'observe_last_actions', 'render_mode' and, of SMAX, {', '.join(map(repr, OPTIONS))}."
             )
         attack_mode = dict(self.options).get("attack_mode", ATTACK_MODES[0])
-        if attack_mode not in ATTACK_MODES:  # SMAX takes anything else for "closest"
+        # SMAX itself would treat any other value as "closest"
+        if attack_mode not in ATTACK_MODES:
             raise ValueError(f"attack_mode={attack_mode!r} is not one of {', '.join(map(repr, ATTACK_MODES))}.")
 
 
-class View(NamedTuple):
+class BattleView(NamedTuple):
     """
-    What can be seen of battles, as arrays of A agents in n copies.
+    Observable part of the state of n battles with A agents.
 
     :param observations: float32 [A, n, width]
-    :param masks: which actions are possible, bool [A, n, k]
-    :param visible: whom of the A-1 others each agent sees, bool [n, A, A-1]
-    :param alive: bool [n, A]
+    :param masks: Which actions are possible, bool [A, n, k]
+    :param visible: Which of the A-1 others each agent sees, bool [n, A, A-1]
+    :param alive: Which agents are alive, bool [n, A]
     """
 
     observations: Any
@@ -81,14 +86,14 @@ class View(NamedTuple):
     alive: Any
 
 
-class Outcome(NamedTuple):
+class BattleOutcome(NamedTuple):
     """
-    How a step went in n copies.
+    Rewards and ends of one step of n battles.
 
-    :param rewards: the team's, float32 [n]
-    :param ended: bool [n]
-    :param won: all enemies are dead and an ally is alive, bool [n]
-    :param cut: ended by the step limit, bool [n]
+    :param rewards: Team rewards, float32 [n]
+    :param ended: Whether the battle has ended, bool [n]
+    :param won: Whether all enemies are dead and an ally is alive, bool [n]
+    :param cut: Whether the battle ended by the step limit, bool [n]
     """
 
     rewards: Any
@@ -97,14 +102,14 @@ class Outcome(NamedTuple):
     cut: Any
 
 
-class Look(NamedTuple):
+class DrawingData(NamedTuple):
     """
-    What a picture of a battle needs besides its units.
+    Data that a picture of a battle needs besides the units.
 
-    :param map_size: width and height
-    :param radii: of the unit types
-    :param full_health: of the unit types
-    :param letters: for the unit types
+    :param map_size: Width and height of the map
+    :param radii: Radius of each unit type
+    :param full_health: Full health of each unit type
+    :param letters: Letter for each unit type
     """
 
     map_size: tuple[float, float]
@@ -115,13 +120,17 @@ class Look(NamedTuple):
 
 class BattleProgram:
     """
-    The compiled functions of a battle. ``keys`` is uint32 [n, 2], one random generator for each copy; ``states`` are SMAX's.
+    The compiled functions of a battle.
 
-    - ``begin(keys)`` -> keys, states, View: new battles
-    - ``advance(keys, states, actions int32 [n, A])`` -> keys, states, View, Outcome: one step, nothing is reset
-    - ``choose(ended bool [n], new, old)`` -> what is new where a battle ended, old elsewhere (keys and states)
+    ``keys`` is uint32 [n, 2], the state of one random generator for each copy. ``states`` is SMAX's own.
 
-    :param config: the rules
+    - ``begin(keys)`` returns keys, states and a ``BattleView`` of new battles.
+    - ``advance(keys, states, actions int32 [n, A])`` performs one step without resets and returns keys, states, a
+      ``BattleView`` and a ``BattleOutcome``.
+    - ``choose(ended bool [n], new, old)`` returns the new keys and states of battles that have ended and the old ones of the
+      others.
+
+    :param config: The rules
     """
 
     def __init__(self, config: BattleConfig):
@@ -135,25 +144,26 @@ class BattleProgram:
         self.n_actions = int(env.num_ally_actions)
         self.stop = int(env.num_movement_actions) - 1
         self.width = int(env.obs_size)
-        self.look = Look(
+        self.drawing = DrawingData(
             (env.map_width, env.map_height),
             np.asarray(env.unit_type_radiuses),
             np.asarray(env.unit_type_health),
             list(env.unit_type_shorthands),
         )
         n_agents, n_features = len(self.agents), len(env.unit_features)
-        # In an ally's block of features
+        # Indices of the last action within the features of one ally
         last_action = [i for i, name in enumerate(env.unit_features) if name.startswith("last_")]
         others = np.array([[j for j in range(n_agents) if j != i] for i in range(n_agents)], dtype=int).reshape(n_agents, -1)
 
         def strong(tree: Any) -> Any:
-            # SMAX's reset and step return different weak types, for which everything would be compiled a second time
+            # SMAX's reset and step return different weak types, for each of which JAX would compile everything once
             return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
 
-        def view(state: Any, observations: dict[str, Any]) -> View:
+        def view(state: Any, observations: dict[str, Any]) -> BattleView:
             units = state.state
             obs = jnp.stack([observations[agent] for agent in self.agents])
             if not config.observe_last_actions:
+                # The allies' features come first in an observation
                 blocks = obs[:, : (n_agents - 1) * n_features].reshape(n_agents, n_agents - 1, n_features)
                 blocks = blocks.at[:, :, jnp.array(last_action)].set(0.0)
                 obs = jnp.concatenate([blocks.reshape(n_agents, -1), obs[:, (n_agents - 1) * n_features :]], axis=1)
@@ -163,82 +173,92 @@ class BattleProgram:
             distances = jnp.linalg.norm(positions[None, :] - positions[:, None], axis=-1)
             sight = env.unit_type_sight_ranges[units.unit_types[:n_agents]]
             sees = (distances < sight[:, None]) & alive[:, None] & alive[None, :]
-            return View(obs, masks, jnp.take_along_axis(sees, jnp.asarray(others), axis=1), alive)
+            return BattleView(obs, masks, jnp.take_along_axis(sees, jnp.asarray(others), axis=1), alive)
 
-        def begin_one(key: Any) -> tuple[Any, Any, View]:
+        def begin_one(key: Any) -> tuple[Any, Any, BattleView]:
             key, reset_key = jax.random.split(key)
             observations, state = env.reset(reset_key)
             return key, strong(state), view(state, observations)
 
-        def advance_one(key: Any, state: Any, actions: Any) -> tuple[Any, Any, View, Outcome]:
+        def advance_one(key: Any, state: Any, actions: Any) -> tuple[Any, Any, BattleView, BattleOutcome]:
             key, step_key = jax.random.split(key)
             joint = {agent: actions[i] for i, agent in enumerate(self.agents)}
-            # step_env() and not step(), which goes on to the next battle and loses the last observation
+            # step_env() instead of step(), which would start the next battle at once and lose the last observation
             observations, state, rewards, dones, _ = env.step_env(step_key, state, joint)
             alive = state.state.unit_alive
             allies, enemies = alive[:n_agents].any(), alive[n_agents:].any()
-            # SMAX's "done" does not tell the step limit from a battle that is over
-            outcome = Outcome(
+            # SMAX's "done" does not distinguish the step limit from a battle that is over, but with the limit both sides live
+            outcome = BattleOutcome(
                 rewards[self.agents[0]], dones["__all__"], allies & ~enemies, dones["__all__"] & allies & enemies
             )
             return key, strong(state), view(state, observations), outcome
 
-        by_agent = View(observations=1, masks=1, visible=0, alive=0)
+        # vmap adds the axis of copies: second for arrays by agent, first for all others
+        by_agent = BattleView(observations=1, masks=1, visible=0, alive=0)
 
         def choose(ended: Any, new: Any, old: Any) -> Any:
             return jax.tree.map(lambda n, o: jnp.where(ended.reshape(-1, *[1] * (n.ndim - 1)), n, o), new, old)
 
         self.begin = jax.jit(jax.vmap(begin_one, out_axes=(0, 0, by_agent)))
         self.advance = jax.jit(jax.vmap(advance_one, out_axes=(0, 0, by_agent, 0)))
-        # Beginning anew everywhere and choosing saves to compile the beginning a second time
+        # Starting battles in all copies and choosing afterwards needs only one compiled version of begin
         self.choose = jax.jit(choose)
         self._jax = jax
 
     @cached_property
     def _structure(self) -> Any:
+        # The tree of SMAX's states with shapes and types, found without running or compiling anything
         keys = self._jax.ShapeDtypeStruct((1, 2), "uint32")
         return self._jax.eval_shape(self.begin, keys)[1]
 
     def leaves(self, states: Any) -> list[Any]:
         """
-        :param states: SMAX's, of n copies
-        :return: the arrays that they consist of, [n, ...] each
+        Return the arrays that states consist of.
+
+        :param states: States of SMAX for n copies
+        :return: Arrays [n, ...]
         """
         return self._jax.tree.leaves(states)
 
     def states(self, leaves: list[Any]) -> Any:
         """
-        :param leaves: what ``leaves`` returned for the same map
-        :return: the states
-        :raises ValueError: if they are of another map
+        Return states made of arrays.
+
+        :param leaves: Arrays that :meth:`leaves` returned for the same map
+        :return: States of SMAX
+        :raises ValueError: If they belong to another map
         """
         expected, structure = self._jax.tree.flatten(self._structure)
-        wanted = [(leaf.shape[1:], leaf.dtype) for leaf in expected]
+        required = [(leaf.shape[1:], leaf.dtype) for leaf in expected]
         given = [(leaf.shape[1:], leaf.dtype) for leaf in leaves]
-        if wanted != given:
-            raise ValueError("This is no state of a battle on this map: states fit the map that they were taken from.")
+        if required != given:
+            raise ValueError("This is not a state of a battle on this map: a state fits the map that it was taken from.")
         return self._jax.tree.unflatten(structure, leaves)
 
 
 @cache
 def battle_program(config: BattleConfig) -> BattleProgram:
     """
-    :param config: the rules
-    :return: the program for them, made and compiled once however many environments use it
+    Return the compiled functions for some rules.
+
+    :param config: The rules
+    :return: The program. All environments with the same rules share it, so that it is compiled only once
     """
     return BattleProgram(config)
 
 
 def map_names() -> list[str]:
     """
-    :return: the maps that SMAX knows, its own order
+    Return the maps of SMAX.
+
+    :return: Names of maps, in SMAX's order
     """
     return list(_import_smax()[1])
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """For jaxmarl's import, which prints, and which leaves sys.stdout and sys.stderr as they were when Python started."""
+    """Suppress what the import of jaxmarl prints, and undo its reset of sys.stdout and sys.stderr to the original streams."""
     before = sys.stdout, sys.stderr, sys.__stdout__
     sys.stdout = sys.__stdout__ = io.StringIO()  # type: ignore[misc, assignment]
     try:
@@ -250,7 +270,9 @@ def _silence() -> Iterator[None]:
 @cache
 def _import_smax() -> tuple[Any, dict[str, Any]]:
     """
-    :return: the class of battles against SMAX's scripted enemies, and its maps by name
+    Import SMAX.
+
+    :return: The class of battles against scripted enemies, and its maps by name
     """
     with _silence():
         from jaxmarl.environments.smax import HeuristicEnemySMAX

@@ -1,4 +1,4 @@
-"""Many battles of SMAX stepped at once."""
+"""Many copies of an SMAX battle that are stepped at once."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,16 +16,18 @@ from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 class SmaxVecEnv(TeamVecEnv):
     """
-    ``num_envs`` copies of :class:`~sb3_belief.envs.adapters.smax.parallel_env.Smax` in one compiled step. Each copy has a
-    random generator of its own: copy i seeded with s + i (as ``seed(s)`` does) lives the life of one ``Smax`` that was reset
-    with the seed s + i and then without one.
+    Vectorised environment of ``num_envs`` copies of :class:`~sb3_belief.envs.adapters.smax.parallel_env.Smax` in one compiled
+    step.
 
-    :param num_envs: number of copies, at least 1
-    :param map_name: one of the maps
-    :param observe_last_actions: leave the last actions of allies in view in the observations
+    Each copy has a random generator of its own. ``seed(s)`` seeds copy i with s + i. That copy then behaves the same as one
+    ``Smax`` that is reset with the seed s + i at first and without a seed afterwards.
+
+    :param num_envs: Number of environment copies, at least 1
+    :param map_name: Name of a map
+    :param observe_last_actions: Whether observations contain the last actions of the allies in view
     :param render_mode: None or ``"rgb_array"``
-    :param options: what to change of SMAX
-    :raises ValueError: for a value that is not allowed
+    :param options: Settings of SMAX to change
+    :raises ValueError: For a value that is not allowed
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class SmaxVecEnv(TeamVecEnv):
             {agent: spaces.Discrete(self.battles.n_actions) for agent in agents},
             render_mode=check_render_mode(render_mode, RENDER_MODES),
         )
+        # All infos share these arrays, which are therefore read-only
         self._no_flags, self._all_flags = np.zeros(len(agents), dtype=bool), np.ones(len(agents), dtype=bool)
         for shared in (self._no_flags, self._all_flags):
             shared.flags.writeable = False
@@ -70,7 +73,7 @@ class SmaxVecEnv(TeamVecEnv):
                 "agent_rewards": reward,
                 "visible": visible,
                 "active": active,
-                # The reward is the team's: a death ends no return, the battle's end ends all
+                # The reward is the team's, so a death ends no agent's return and the end of the battle ends all of them
                 "life_end": self._all_flags if ended and not cut else self._no_flags,
                 "truncated": self._all_flags if cut else self._no_flags,
             }
@@ -101,23 +104,27 @@ class SmaxVecEnv(TeamVecEnv):
 
     def action_masks(self) -> dict[str, np.ndarray]:
         """
-        :return: {agent: bool [num_envs, k]}: the dead may only stop
+        Return which actions are possible now.
+
+        :return: {agent: bool [num_envs, k]}. Dead agents may only stop
         """
         return dict(zip(self.possible_agents, self.battles.masks, strict=True))
 
     def get_state(self) -> list[dict[str, Any]]:
         """
-        :return: for each copy all that decides how it goes on
+        Return everything that determines the following steps of each copy.
+
+        :return: One state for each copy
         """
         return self.battles.get_states()
 
     def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
         """
-        Go on where ``get_state`` was called. The monitoring of the running episodes starts anew.
+        Restore the states of all copies. The monitored returns and lengths of the running episodes start from zero.
 
-        :param states: what ``get_state`` returned with as many copies of the same map
-        :return: the current observations, {agent: array [num_envs, width]}
-        :raises ValueError: if the number of copies or the map differs
+        :param states: States that ``get_state`` returned for as many copies of the same map
+        :return: The current observations, {agent: array [num_envs, width]}
+        :raises ValueError: If the number of copies or the map differs
         """
         self.battles.set_states(states)
         self._zero_episode_sums()
@@ -125,6 +132,8 @@ class SmaxVecEnv(TeamVecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """
-        :return: a picture of each copy, uint8 [height, width, 3]
+        Return a picture of each copy.
+
+        :return: One array per copy, uint8 [height, width, 3]
         """
         return [draw(self.battles, copy) for copy in range(self.num_envs)]
