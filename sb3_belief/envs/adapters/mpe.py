@@ -80,7 +80,7 @@ class MpeParallelEnv(aec_to_parallel_wrapper):
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        Advance the episode by one step.
+        Let all agents act and return the results of the world's step.
 
         :param actions: Actions by agent
         :return: Observations, rewards, terminations, truncations and infos, by agent
@@ -205,7 +205,7 @@ class WithinRadius(Adapter):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        Start an episode.
+        Reset the environment and hide teammates beyond the radius.
 
         :param seed: Seed of the environment. With None its random generator continues
         :param options: Passed on to the environment
@@ -216,7 +216,7 @@ class WithinRadius(Adapter):
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        Advance the episode by one step.
+        Step the environment and hide teammates beyond the radius.
 
         :param actions: Actions by agent
         :return: Observations, rewards, terminations, truncations and infos, by agent

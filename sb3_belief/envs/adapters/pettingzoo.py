@@ -148,7 +148,7 @@ class TurnBased(Adapter):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        Start an episode.
+        Start an episode, in which no agent has had its turn yet.
 
         :param seed: Seed of the environment. With None its random generator continues
         :param options: Passed on to the environment
@@ -205,7 +205,7 @@ class SplitMasks(Adapter):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        Start an episode.
+        Reset the environment and move the masks to the infos.
 
         :param seed: Seed of the environment. With None its random generator continues
         :param options: Passed on to the environment
@@ -215,7 +215,7 @@ class SplitMasks(Adapter):
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        Advance the episode by one step.
+        Step the environment and move the masks to the infos.
 
         :param actions: Actions by agent
         :return: Observations, rewards, terminations, truncations and infos, by agent

@@ -43,13 +43,11 @@ class StarCraftV2(StarCraft):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """
-        Start a battle.
+        Start a battle, as the base class does.
 
-        :param seed: Seed of the package's random generators, with which StarCraft II is launched again too. With None both
-            continue
+        :param seed: Seed of the random generators, with which StarCraft II is also launched again. With None both continue
         :param options: Not used
         :return: Observations and infos, by agent
-        :raises RuntimeError: If StarCraft II repeatedly loses its connection
         """
         if seed is not None or not hasattr(self, "_python"):
             source = np.random.SeedSequence(seed)
@@ -61,13 +59,7 @@ class StarCraftV2(StarCraft):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """
-        Advance the battle by one step.
-
-        :param actions: Action of every agent, including dead ones
-        :return: Observations, rewards, terminations, truncations and infos, by agent
-        :raises ValueError: If an agent's action is missing, outside its space or impossible now, or if no episode is under way
-        """
+        """Advance the battle by one step, as the base class does."""
         with self._own_generators():
             return super().step(actions)
 

@@ -104,7 +104,7 @@ class TrafficJunctionVecEnv(TeamVecEnv):
 
     def set_arrival_rate(self, arrival_rate: float) -> None:
         """
-        Set the arrival rate of all copies from the next step on.
+        Set the arrival rate of all copies, see :meth:`TrafficJunction.set_arrival_rate`.
 
         :param arrival_rate: Probability in [0, 1] that a car wants to enter, per entry and step
         :raises ValueError: If it is not a number in [0, 1]
