@@ -3,7 +3,7 @@
 from sb3_belief.belief.history import History, append_rows, empty_history
 from sb3_belief.belief.layout import ActionLayout
 from sb3_belief.belief.loss import ACTION_LOSSES, cross_entropy, expected_actions, kl_divergence, squared_error
-from sb3_belief.belief.network import SIMILARITIES, BeliefOutput, DynamicBelief, HistoryContext, n_selected
+from sb3_belief.belief.network import SIMILARITIES, BeliefOutput, DynamicBelief, HistoryContext, filled_rows, n_selected
 from sb3_belief.belief.variants import VARIANTS, Variant
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "cross_entropy",
     "empty_history",
     "expected_actions",
+    "filled_rows",
     "kl_divergence",
     "n_selected",
     "squared_error",

@@ -19,12 +19,6 @@ class History(NamedTuple):
     actions: th.Tensor
     valid: th.Tensor
 
-    def filled(self) -> "History":
-        """The rows that hold a step, without the rest."""
-        if bool(self.valid.all()):
-            return self
-        return History(self.observations[self.valid], self.actions[self.valid], self.valid[self.valid])
-
 
 def empty_history(length: int, observation_dim: int, action_dim: int) -> History:
     """
@@ -46,9 +40,8 @@ def append_rows(history: History, observations: th.Tensor, actions: th.Tensor) -
     :return: A new history of the same length; the one given is left as it is
     """
     length = len(history.valid)
-    old = history.filled()
-    observations = th.cat([old.observations, observations.to(old.observations)])[-length:]
-    actions = th.cat([old.actions, actions.to(old.actions)])[-length:]
+    observations = th.cat([history.observations[history.valid], observations.to(history.observations)])[-length:]
+    actions = th.cat([history.actions[history.valid], actions.to(history.actions)])[-length:]
     missing = length - len(observations)
     if missing:
         observations = th.cat([observations, observations.new_zeros(missing, observations.shape[1])])

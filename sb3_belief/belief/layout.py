@@ -50,17 +50,8 @@ class ActionLayout:
             [list(range(start, start + width)) for _, start, width in self.blocks if width == common]
             for common in sorted({block.width for block in self.blocks})
         ]
-
-        self._owner_index: th.Tensor | None = None
-
-    def owner_index(self, device: th.device) -> th.Tensor:
-        """
-        :param device: Where it is needed
-        :return: ``owners`` as an index, made once
-        """
-        if self._owner_index is None or self._owner_index.device != device:
-            self._owner_index = th.as_tensor(self.owners, device=device)
-        return self._owner_index
+        #: ``owners`` as an index
+        self.owner_index = th.as_tensor(self.owners, dtype=th.long)
 
     def columns_of(self, owner: int) -> slice:
         """

@@ -48,7 +48,7 @@ def cross_entropy(prediction: th.Tensor, actions: th.Tensor, visible: th.Tensor,
 
 def _mean_over_visible(errors: th.Tensor, visible: th.Tensor, layout: ActionLayout) -> th.Tensor:
     # Selecting columns of numbers is twice as fast as of truth values
-    weights = visible.to(errors.dtype).index_select(1, layout.owner_index(errors.device))
+    weights = visible.to(errors.dtype).index_select(1, layout.owner_index.to(errors.device))
     return (errors * weights).sum() / visible.sum().clamp(min=1)
 
 

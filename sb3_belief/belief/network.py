@@ -31,7 +31,7 @@ class BeliefOutput(NamedTuple):
     :param log_std: Log standard deviation of its distribution, ``[B, z]``; minus infinity where it is a single point
     :param prediction: The others' predicted actions, flattened, ``[B, W]``: numbers or logits, whatever the loss makes of
         them; None for a belief that predicts nothing
-    :param kept: The history rows attended to, as indices into the rows filled so far, int32 ``[B, N_h]``;
+    :param selected: The history rows attended to, as indices into the rows filled so far, int32 ``[B, N_h]``;
         ``N_h`` is 0 while the history is empty, and for a belief without one
     :param weights: Their attention weights, ``[B, N_h]``, each row sums to one
     """
@@ -40,7 +40,7 @@ class BeliefOutput(NamedTuple):
     mean: th.Tensor
     log_std: th.Tensor
     prediction: th.Tensor | None
-    kept: th.Tensor
+    selected: th.Tensor
     weights: th.Tensor
 
 
@@ -65,6 +65,18 @@ def n_selected(keep_ratio: float, n_rows: int) -> int:
     :return: How many of them are attended to, ``N_h`` of eq. 3: a share of ``keep_ratio``, at least one
     """
     return min(n_rows, max(1, round(keep_ratio * n_rows)))
+
+
+def filled_rows(history: History) -> History:
+    """
+    Return the rows of a history that hold a step, without the rest.
+
+    :param history: A history
+    :return: Its valid rows; the history itself where all are valid
+    """
+    if bool(history.valid.all()):
+        return history
+    return History(*(rows[history.valid] for rows in history))
 
 
 class DynamicBelief(nn.Module):
@@ -136,7 +148,7 @@ class DynamicBelief(nn.Module):
         :param history: The agent's history
         :return: Its filled rows as directions, keys and values
         """
-        rows = history.filled()
+        rows = filled_rows(history)
         embeddings = self.observation_embedding(rows.observations)
         states = embeddings + self.action_embedding(rows.actions)
         directions = F.normalize(self._compared(rows.observations, embeddings), dim=-1)
@@ -147,7 +159,7 @@ class DynamicBelief(nn.Module):
         observations: th.Tensor,
         history: History | None = None,
         noise: th.Tensor | None = None,
-        kept: th.Tensor | None = None,
+        selected: th.Tensor | None = None,
         context: HistoryContext | None = None,
         predict: bool = True,
     ) -> BeliefOutput:
@@ -156,7 +168,7 @@ class DynamicBelief(nn.Module):
         :param history: The agent's history; a variant that does not attend ignores it
         :param noise: Standard normal noise ``[B, z]`` for eq. 5; without it the belief is its mean. A variant that does not
             sample ignores it
-        :param kept: The rows to attend to, ``[B, N_h]``, if they have been selected before; by default those most
+        :param selected: The rows to attend to, ``[B, N_h]``, if they have been selected before; by default those most
             similar to each observation are selected here (eq. 3)
         :param context: ``encode_history(history)``, if it is at hand
         :param predict: Whether the others' actions are wanted
@@ -165,8 +177,8 @@ class DynamicBelief(nn.Module):
         """
         embedding = self.observation_embedding(observations)
         if self.variant.attends:
-            if context is None and history is not None and kept is not None:
-                summary, weights = self._attend_to_states(embedding, history.filled(), kept)
+            if context is None and history is not None and selected is not None:
+                summary, weights = self._attend_to_states(embedding, filled_rows(history), selected)
             else:
                 if context is None:
                     if history is None:
@@ -174,12 +186,12 @@ class DynamicBelief(nn.Module):
                             "this belief attends to the agent's history: pass it (sb3_belief.belief.empty_history)"
                         )
                     context = self.encode_history(history)
-                kept = self._most_similar(observations, embedding, context) if kept is None else kept
-                summary, weights = attend(self.query(embedding), context.keys, context.values, kept)
+                selected = self._most_similar(observations, embedding, context) if selected is None else selected
+                summary, weights = attend(self.query(embedding), context.keys, context.values, selected)
             embedding = embedding + summary
         else:
-            kept = th.zeros(*observations.shape[:-1], 0, dtype=th.int, device=observations.device)
-            weights = embedding.new_zeros(kept.shape)
+            selected = th.zeros(*observations.shape[:-1], 0, dtype=th.int, device=observations.device)
+            weights = embedding.new_zeros(selected.shape)
         encoded = self.encoder(embedding)
         if self.variant.samples:
             mean, log_std = encoded.chunk(2, dim=-1)
@@ -190,7 +202,7 @@ class DynamicBelief(nn.Module):
             latent = mean = encoded
             log_std = th.full_like(mean, -math.inf)
         prediction = self.decoder(latent) if predict and self.variant.predicts else None
-        return BeliefOutput(latent, mean, log_std, prediction, kept, weights)
+        return BeliefOutput(latent, mean, log_std, prediction, selected, weights)
 
     def _compared(self, observations: th.Tensor, embeddings: th.Tensor) -> th.Tensor:
         return (embeddings if self.similarity == "embedding" else observations).detach()
@@ -205,7 +217,7 @@ class DynamicBelief(nn.Module):
         similarity = self._compared(observations, embeddings) @ context.directions.mT
         return topk_indices(similarity, n_selected(self.keep_ratio, similarity.shape[-1]))
 
-    def _attend_to_states(self, embedding: th.Tensor, rows: History, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _attend_to_states(self, embedding: th.Tensor, rows: History, selected: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
         names no softmax; "scaled" is read as in the transformer, by the root of the width.
@@ -213,10 +225,10 @@ class DynamicBelief(nn.Module):
         Without keys and values of all rows, since both are linear in the states: the query goes to the states by way of the
         keys' weights, and the mean of values is the value of the mean. In a single pass these are fewer products where B < T.
         """
-        if kept.shape[-1] == 0:
+        if selected.shape[-1] == 0:
             # No gradient either: one of zeros would count as a step of Adam's
-            return th.zeros_like(embedding), embedding.new_zeros(kept.shape)
+            return th.zeros_like(embedding), embedding.new_zeros(selected.shape)
         states = self.observation_embedding(rows.observations) + self.action_embedding(rows.actions)
         queries = self.query(embedding) @ (self.key.weight / math.sqrt(self.embedding_dim))
-        mean, weights = attend(queries, states, states, kept)
+        mean, weights = attend(queries, states, states, selected)
         return self.value(mean), weights

@@ -6,7 +6,6 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -16,11 +15,12 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_selected
-from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
+from sb3_belief.belief_ppo.extractor import fitting_extractor
 from sb3_belief.belief_ppo.options import LATENT_DIM, BeliefOptions
-from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of, read_others
-from sb3_belief.belief_ppo.policies import BeliefPolicyMixin, fitting_extractor
+from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
 if TYPE_CHECKING:
     _Algorithm = OnPolicyAlgorithm
@@ -146,17 +146,12 @@ class BeliefAlgorithmMixin(_Algorithm):
         # SB3 calls this once a step, right before it bootstraps time limits and adds the step to the buffer
         super()._update_info_buffer(infos, dones)
         if dones is not None and dones.any():
-            self.policy.terminal_values.compute(self.policy, infos, dones)
+            self.policy.attach_terminal_values(infos, dones)
         active = np.ones(self.n_envs, dtype=bool)
         # SB3 takes environments that return fewer infos than copies
         active[: len(infos)] = [info.get("active", True) for info in infos]
-        if not self.policy.has_belief:
-            self.rollout_buffer.stage(active)
-            return
-        actions, visible = read_others(infos, self.policy.layout)
-        assert self.policy.acted_with is not None
-        minibatch = BeliefMinibatch(*self.policy.acted_with, th.as_tensor(actions), th.as_tensor(visible))
-        self.rollout_buffer.stage(active, minibatch)
+        others = read_others(infos, self.policy.layout) if self.policy.has_belief else ()
+        self.rollout_buffer.stage(active, *others)
 
     # -- update --------------------------------------------------------------------------------------------------------
 
@@ -176,13 +171,8 @@ class BeliefAlgorithmMixin(_Algorithm):
         for name, value in measure_belief(policy, buffer).items():
             self.logger.record(f"belief/{name}", value)
         policy.action_coef, policy.kl_coef = self._coefficient("action_coef"), self._coefficient("kl_coef")
-        buffer.on_minibatch = policy.stage
-        try:
-            if learns:
-                self._update()
-        finally:
-            buffer.on_minibatch = None
-            policy.stage(None)
+        if learns:
+            self._update()
         policy.remember(observations, actions)
 
     def _coefficient(self, name: str) -> float:

@@ -1,12 +1,14 @@
 """
 Rollout buffers that also hold what a belief is trained on, and leave out the steps in which the agent was not in play.
 
-SB3 fills its buffer inside `collect_rollouts`, which has no place for more. But `_update_info_buffer` is called once a
-step, just before `add`: there the algorithm stages the rest of the row with :meth:`BeliefBufferMixin.stage`.
+The belief's data reaches SB3's methods as an argument, although SB3 knows nothing of it: :func:`attach` puts it on an object
+that SB3 only passes on. In a rollout these are the values, from the policy to ``RolloutBuffer.add``; in an update the
+observations of a minibatch, from ``RolloutBuffer.get`` to ``evaluate_actions``. What the environment says of a step comes by
+way of ``_update_info_buffer``, which SB3 calls once a step just before ``add``: see :meth:`BeliefBufferMixin.stage`.
 """
 
-from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Generator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,21 +16,107 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_belief.belief import ActionLayout
+
+Carrier = TypeVar("Carrier")
+
+
+class _CarrierDict(dict):
+    """A dict that takes attributes."""
+
+
+class _CarrierArray(np.ndarray):
+    """An array that takes attributes."""
+
+
+def attach(carrier: Carrier, data: Any) -> Carrier:
+    """
+    Attach data to an object that SB3 passes on untouched.
+
+    :param carrier: A tensor, an array or a dict of them
+    :param data: What to attach
+    :return: The same values in a new object, which shares their memory; the carrier itself stays as it is
+    """
+    result: Any
+    if isinstance(carrier, th.Tensor):
+        result = carrier.view_as(carrier)
+    elif isinstance(carrier, dict):
+        result = _CarrierDict(carrier)
+    else:
+        result = np.asarray(carrier).view(_CarrierArray)
+    result.belief_data = data
+    return result
+
+
+def attached(carrier: Any) -> Any:
+    """
+    Return what is attached to an object.
+
+    :param carrier: Any object
+    :return: The data given to :func:`attach`; None where nothing is attached
+    """
+    return getattr(carrier, "belief_data", None)
+
+
+class SampledLatents(NamedTuple):
+    """
+    What an agent drew and selected for the belief with which it acted; ``B`` rows, one for each copy of the environment.
+
+    :param noise: The noise of eq. 5, ``[B, z]``; of width 0 for a belief that does not sample
+    :param selected: The history rows attended to, int32 ``[B, N_h]``; of width 0 for a belief without a history
+    """
+
+    noise: th.Tensor
+    selected: th.Tensor
+
 
 class BeliefMinibatch(NamedTuple):
     """
     What a minibatch holds beyond SB3's samples; ``B`` rows, in the same order.
 
     :param noise: The noise of eq. 5 with which the agent acted, ``[B, z]``; of width 0 for a belief that does not sample
-    :param kept: The history rows it attended to, ``[B, N_h]``; of width 0 for a belief without a history
-    :param others_actions: ``[B, W]``, zero where not visible
-    :param others_visible: bool ``[B, n_others]``
+    :param selected: The history rows it attended to, ``[B, N_h]``; of width 0 for a belief without a history
+    :param others_actions: The others' flattened actions, ``[B, W]``, zero where not visible
+    :param others_visible: Whose action was visible, bool ``[B, n_others]``
     """
 
     noise: th.Tensor
-    kept: th.Tensor
+    selected: th.Tensor
     others_actions: th.Tensor
     others_visible: th.Tensor
+
+
+def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Read what the agent has seen of the others in a step.
+
+    :param infos: The step's `info` of each copy of the environment
+    :param layout: Layout of the others' actions
+    :return: The others' actions, float32 ``[n_envs, W]``, zero where not visible, and visibility, bool ``[n_envs, n_others]``.
+        Invisible actions are zeroed here once more, so that a careless environment cannot leak what the agent did not see
+    :raises ValueError: If an info lacks them, or has them in another shape
+    """
+    actions = _rows("others_actions", layout.width, infos).astype(np.float32, copy=False)
+    visible = _rows("others_visible", layout.n_others, infos).astype(bool, copy=False)
+    return np.where(visible.take(layout.owners, axis=1), actions, np.float32(0.0)), visible
+
+
+def _rows(key: str, width: int, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    try:
+        rows = [np.asarray(info[key]) for info in infos]
+    except KeyError:
+        raise ValueError(
+            f"the environment names others in 'others_action_spaces', but its info lacks {key!r}; every step must bring "
+            "'others_actions' and 'others_visible' (a Team provides both)"
+        ) from None
+    wrong = {row.shape for row in rows} - {(width,)}
+    if wrong:
+        raise ValueError(
+            f"info brings {key} of shape {sorted(wrong)[0]}; the others' action spaces ask for {(width,)}, see "
+            "sb3_belief.belief_ppo.others.action_layout (actions) and one truth value for each other (visible)"
+        )
+    # A third of the time of stack()
+    return np.concatenate(rows).reshape(len(rows), width)
 
 
 if TYPE_CHECKING:
@@ -36,19 +124,23 @@ if TYPE_CHECKING:
 else:
     _Buffer = object
 
-_EXTRAS = ("noise", "kept", "others_actions", "others_visible", "active")
+# The place of the values among the arguments of add()
+_VALUE = 4
+_EXTRAS = ("noise", "selected", "others_actions", "others_visible", "active")
 
 
 class BeliefBufferMixin(_Buffer):
     """
+    Makes a rollout buffer of SB3's one with a belief's data.
+
     :param noise_dim: ``z``, 0 where no belief is sampled
-    :param history_kept: The most history rows that are attended to, ``N_h``, 0 where none are
+    :param max_selected: The most history rows that are attended to, ``N_h``, 0 where none are
     :param others_width: ``W``, 0 without a belief
     :param n_others: Number of others, 0 without a belief
     """
 
     noise: np.ndarray
-    kept: np.ndarray
+    selected: np.ndarray
     others_actions: np.ndarray
     others_visible: np.ndarray
     active: np.ndarray
@@ -63,42 +155,53 @@ class BeliefBufferMixin(_Buffer):
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
-        self._widths = dict(noise=noise_dim, kept=max_selected, others_actions=others_width, others_visible=n_others)
-        #: Told of every minibatch before SB3 gets its part of it
-        self.on_minibatch: Callable[[BeliefMinibatch], None] | None = None
+        self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
         super().reset()
         rows = self.buffer_size, self.n_envs
         self.noise = np.zeros((*rows, self._widths["noise"]), dtype=np.float32)
-        self.kept = np.zeros((*rows, self._widths["kept"]), dtype=np.int32)
+        self.selected = np.zeros((*rows, self._widths["selected"]), dtype=np.int32)
         self.others_actions = np.zeros((*rows, self._widths["others_actions"]), dtype=np.float32)
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
         self.active = np.ones(rows, dtype=bool)
-        #: Rows attended to are as many in every step of a rollout, but grow with the history from one to the next
+        # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
         self._n_selected = 0
 
-    def stage(self, active: np.ndarray, minibatch: BeliefMinibatch | None = None) -> None:
+    def stage(
+        self, active: np.ndarray, others_actions: np.ndarray | None = None, others_visible: np.ndarray | None = None
+    ) -> None:
         """
-        Write what SB3's ``add`` does not know into the row that it will fill next.
+        Write what the environment says of a step into the row that ``add`` fills next.
 
         :param active: Whether the agent was in play when it acted, bool ``[n_envs]``
-        :param minibatch: The belief's part of the step, ``n_envs`` rows; None without a belief
+        :param others_actions: float32 ``[n_envs, W]``, zero where not visible; None without a belief
+        :param others_visible: bool ``[n_envs, n_others]``; None without a belief
         """
         self.active[self.pos] = active
-        if minibatch is None:
-            return
-        self._n_selected = minibatch.kept.shape[1]
-        self.noise[self.pos] = minibatch.noise.cpu().numpy()
-        self.kept[self.pos, :, : self._n_selected] = minibatch.kept.cpu().numpy()
-        self.others_actions[self.pos] = minibatch.others_actions.numpy()
-        self.others_visible[self.pos] = minibatch.others_visible.numpy()
+        if others_actions is not None and others_visible is not None:
+            self.others_actions[self.pos] = others_actions
+            self.others_visible[self.pos] = others_visible
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """
+        Add a step as SB3 does, with the :class:`SampledLatents` that the policy has attached to its values.
+
+        :param args: As in SB3 or sb3-contrib; the values are the very object that the policy returned
+        :param kwargs: As in SB3 or sb3-contrib
+        """
+        sampled = attached(kwargs["value"] if "value" in kwargs else args[_VALUE])
+        if sampled is not None:
+            self._n_selected = sampled.selected.shape[1]
+            self.noise[self.pos] = sampled.noise.cpu().numpy()
+            self.selected[self.pos, :, : self._n_selected] = sampled.selected.cpu().numpy()
+        super().add(*args, **kwargs)
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
         """
-        As SB3's, except that the value of an inactive step is what it went on to earn: the critic is never trained there,
-        so its opinion must not enter the advantage of the steps before.
+        Compute returns as SB3 does, except that the value of an inactive step is what it went on to earn: the critic is never
+        trained there, so its opinion must not enter the advantage of the steps before.
 
         :param last_values: Values of the observations after the last step, ``[n_envs]``
         :param dones: Whether the agent's return ended with the last step, ``[n_envs]``
@@ -113,10 +216,13 @@ class BeliefBufferMixin(_Buffer):
 
     def recent(self, n_rows: int) -> tuple[np.ndarray | dict[str, np.ndarray], np.ndarray]:
         """
-        The last active steps of all env copies, interleaved by time. Must be called before :meth:`get`, which reorders.
+        Return the last active steps of all copies, interleaved by time.
+
+        It must be called before :meth:`get`, which reorders the rows.
 
         :param n_rows: The most rows to return
         :return: The observations of these steps and the others' actions, oldest first
+        :raises RuntimeError: If called after :meth:`get`
         """
         if self.generator_ready:
             raise RuntimeError("recent() must be called before the first get() of an update: that reorders the rows")
@@ -134,40 +240,48 @@ class BeliefBufferMixin(_Buffer):
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """
+        Yield minibatches as SB3 does, without any inactive step and with a :class:`BeliefMinibatch` attached to the
+        observations.
+
         :param batch_size: Rows of a minibatch, before inactive steps are left out of it; None for all at once
-        :return: Minibatches as SB3 yields them, without any inactive step; what is left of one then, if less than two rows,
-            goes with the next
+        :return: The minibatches. If less than two rows are left of one, they go with the next: a single row has no advantage
+            statistics (sb3-contrib would divide by nothing)
         """
         if not self.generator_ready:
             for name in _EXTRAS:
                 array = getattr(self, name)
                 setattr(self, name, array.swapaxes(0, 1).reshape(self.active.size, *array.shape[2:]))
-        self._held = np.zeros(0, dtype=int)
-        yield from (samples for samples in super().get(batch_size) if samples is not None)
+        leaves_out = not self.active.all()
+        left_over = np.zeros(0, dtype=int)
+        indices: Generator[Any, None, None] = super().get(batch_size)
+        for rows in indices:
+            if leaves_out:
+                rows = np.concatenate([left_over, rows[self.active[rows]]])
+                left_over = rows[:0]
+                if len(rows) < 2:
+                    left_over = rows
+                    continue
+            yield self._samples(rows)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
-        if not self.active.all():
-            batch_inds = np.concatenate([self._held, batch_inds[self.active[batch_inds]]])
-            # A single row has no advantage statistics (sb3-contrib would divide by nothing): it goes with the next minibatch
-            if len(batch_inds) < 2:
-                self._held = batch_inds
-                return None
-            self._held = batch_inds[:0]
-        if self.on_minibatch is not None:
-            self.on_minibatch(self.belief_minibatch(batch_inds))
-        return super()._get_samples(batch_inds, env)
+        # SB3's get() shuffles and cuts; which rows of a minibatch are used is decided in ours
+        return batch_inds
+
+    def _samples(self, rows: np.ndarray) -> Any:
+        samples = super()._get_samples(rows)
+        if self._widths["others_visible"] == 0:
+            return samples
+        return samples._replace(observations=attach(samples.observations, self.belief_minibatch(rows)))
 
     def belief_minibatch(self, rows: Any) -> BeliefMinibatch:
         """
+        Return the belief's part of some rows.
+
         :param rows: Index into the rows as they are ordered at present
-        :return: The belief's part of these rows, on the buffer's device; for a slice it is a part of the buffer itself
+        :return: Their data, on the buffer's device; for a slice it is a part of the buffer itself
         """
-        parts = (
-            self.noise[rows],
-            self.kept[rows][..., : self._n_selected],
-            self.others_actions[rows],
-            self.others_visible[rows],
-        )
+        selected = self.selected[rows][..., : self._n_selected]
+        parts = self.noise[rows], selected, self.others_actions[rows], self.others_visible[rows]
         return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 
@@ -176,4 +290,4 @@ class BeliefRolloutBuffer(BeliefBufferMixin, RolloutBuffer):
 
 
 class BeliefDictRolloutBuffer(BeliefBufferMixin, DictRolloutBuffer):
-    """The same for Dict observations."""
+    """SB3's rollout buffer for Dict observations with the belief's part of each step, see :class:`BeliefBufferMixin`."""

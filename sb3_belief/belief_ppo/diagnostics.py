@@ -9,7 +9,7 @@ from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer, Maska
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_belief.belief import ActionLayout, kl_divergence
-from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch, attach
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
@@ -52,7 +52,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         history_gain=0.0,
     )
     # The rollout has encoded the history already
-    output = policy.features_extractor.infer(flat, minibatch.noise, minibatch.kept)
+    output = policy.features_extractor.infer(flat, minibatch.noise, minibatch.selected)
     if variant.samples:
         measured["kl"] = float(kl_divergence(output.mean, output.log_std))
     if variant.attends:
@@ -62,7 +62,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     measured["action_loss"] = float(policy.action_error(output.prediction, minibatch))
     if policy.history is not None and policy.history.valid.any():
         with_shuffled = policy.history._replace(actions=_shuffled(policy.history.actions, policy.history.valid))
-        shuffled = belief(flat, with_shuffled, minibatch.noise, minibatch.kept)
+        shuffled = belief(flat, with_shuffled, minibatch.noise, minibatch.selected)
         measured["history_gain"] = float(policy.action_error(shuffled.prediction, minibatch)) - measured["action_loss"]
     accuracy, base_rate = _accuracies(output.prediction, minibatch, policy.layout)
     if not math.isnan(accuracy):
@@ -93,8 +93,7 @@ def _first_log_ratio(
     masks = {}
     if isinstance(buffer, (MaskableRolloutBuffer, MaskableDictRolloutBuffer)):
         masks["action_masks"] = buffer.to_torch(buffer.action_masks[step])
-    policy.stage(minibatch)
-    _, log_prob, _ = policy.evaluate_actions(observations, actions, **masks)
+    _, log_prob, _ = policy.evaluate_actions(attach(observations, minibatch), actions, **masks)
     return float((log_prob - buffer.to_torch(buffer.log_probs[step])).abs().max())
 
 

@@ -1,15 +1,19 @@
-"""The features extractor that puts a belief about the others beside the features of the observation."""
+"""The features extractor that infers a belief about the others beside the features of the observation, and their fusion."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+    NatureCNN,
+)
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
@@ -17,11 +21,32 @@ from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryConte
 from sb3_belief.belief_ppo.options import BeliefOptions
 from sb3_belief.common.tensor_version import TensorVersions
 
+# The least height and width of which NatureCNN's convolutions leave anything
+_MIN_IMAGE_SIZE = 36
+
+
+def fitting_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+    """
+    Return the features extractor of that policy of SB3 which is meant for an observation space.
+
+    :param observation_space: Of the agent
+    :return: The class
+    """
+    if isinstance(observation_space, spaces.Dict):
+        return CombinedExtractor
+    if isinstance(observation_space, spaces.Box) and is_image_space(observation_space):
+        _, height, width = observation_space.shape
+        if min(height, width) >= _MIN_IMAGE_SIZE:
+            return NatureCNN
+    return FlattenExtractor
+
 
 def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
     """
-    :param observation: A preprocessed observation (batch first), or a dict of them
-    :return: One row an observation, ``[B, d_o]``; the parts of a dict in the order of its keys
+    Flatten observations.
+
+    :param observation: Preprocessed observations (batch first), or a dict of them
+    :return: One row for each, ``[B, d_o]``; the parts of a dict in the order of its keys
     """
     if isinstance(observation, dict):
         return th.cat([observation[key].flatten(1).float() for key in sorted(observation)], dim=1)
@@ -30,17 +55,39 @@ def flatten_observation(observation: th.Tensor | TensorDict) -> th.Tensor:
 
 def flat_observations(policy: BasePolicy, observations: PyTorchObs) -> th.Tensor:
     """
-    :param policy: Whose observations they are
-    :param observations: As the environment gives them, batch first
-    :return: Preprocessed as SB3 does, and flat, ``[B, d_o]``
+    Preprocess observations as SB3 does, and flatten them.
+
+    :param policy: The policy that observes
+    :param observations: As the environment returns them, batch first
+    :return: ``[B, d_o]``
     """
     return flatten_observation(preprocess_obs(observations, policy.observation_space, policy.normalize_images))
 
 
+@dataclass(slots=True)
+class BeliefPass:
+    """
+    How the belief of one forward pass is drawn, and what came of it.
+
+    A method of the policy makes it and passes it on with the observations; the extractor fills in ``noise`` and ``output``;
+    the same method reads them when the pass is over, and drops it.
+
+    :param noise: The noise of eq. 5, ``[B, z]``; None for the mean of the belief
+    :param selected: The history rows to attend to, ``[B, N_h]``; None for the most similar ones
+    :param sample: Whether to draw the noise in this pass
+    :param output: The belief
+    """
+
+    noise: th.Tensor | None = None
+    selected: th.Tensor | None = None
+    sample: bool = False
+    output: BeliefOutput | None = None
+
+
 class BeliefFeatures(NamedTuple):
     """
-    What policy and value are computed from. Two tensors instead of one: SB3 only passes them on, and the features of most
-    observations need no gradient, which they would get in one tensor with the belief.
+    What policy and value are computed from. These are two tensors instead of one because SB3 only passes them on, and because
+    the features of most observations need no gradient, which they would get in one tensor with the belief.
 
     :param own: Features of the observation, ``[B, features]``
     :param latent: The belief about the others, ``[B, z]``
@@ -50,38 +97,16 @@ class BeliefFeatures(NamedTuple):
     latent: th.Tensor
 
 
-@dataclass(slots=True)
-class Passing:
-    """
-    What changes from pass to pass. Not in the module itself, whose attributes take ten times as long to set.
-
-    :param given: Noise, history rows and whether to sample, see :meth:`BeliefExtractor.conditioned`
-    :param output: What the last pass believed, for whoever called it
-    :param noise: The noise it drew
-    :param acted_with: Noise and history rows of the last pass that chose actions, see :meth:`BeliefPolicyMixin.acted_with`
-    :param context: The encoded history
-    :param context_of: The weights and history that it was made from
-    """
-
-    given: tuple[th.Tensor | None, th.Tensor | None, bool] = (None, None, False)
-    output: BeliefOutput | None = None
-    noise: th.Tensor | None = None
-    acted_with: tuple[th.Tensor, th.Tensor] | None = None
-    context: HistoryContext | None = None
-    context_of: TensorVersions = field(default_factory=TensorVersions)
-
-
 class BeliefExtractor(BaseFeaturesExtractor):
     """
     Features of the observation and, beside them, the belief about the others: :class:`BeliefFeatures`.
 
-    The history belongs to the weights: it is kept in buffers, and so is saved, loaded and moved with the policy. How the
-    belief is drawn is said by :meth:`conditioned`; without it the belief is its mean.
+    The history belongs to the weights: it is kept in buffers, and so is saved, loaded and moved with the policy.
 
     :param observation_space: The agent's observation space
     :param features: Extractor of the features of the observation itself
     :param belief: The belief network
-    :param options: What the user says about the belief
+    :param options: The user's options of the belief
     """
 
     history_observations: th.Tensor
@@ -103,57 +128,52 @@ class BeliefExtractor(BaseFeaturesExtractor):
             history = empty_history(options.history_length, belief.observation_dim, belief.action_dim)
             for name, rows in history._asdict().items():
                 self.register_buffer(f"history_{name}", rows)
-        self.passing = Passing()
+        self._context: HistoryContext | None = None
+        self._context_versions = TensorVersions()
 
     def __getstate__(self) -> dict[str, Any]:
-        # What the last pass left behind is made again where it is needed
-        return {**vars(self), "passing": Passing()}
+        # The encoded history is made again where it is needed
+        return {**vars(self), "_context": None, "_context_versions": TensorVersions()}
 
     @property
     def history(self) -> History | None:
-        """The history the belief is inferred from at present; None for a belief without one."""
+        """The history from which the belief is inferred at present; None for a belief without one."""
         if not self.belief.variant.attends:
             return None
         return History(self.history_observations, self.history_actions, self.history_valid)
 
     def remember(self, observations: th.Tensor, actions: th.Tensor) -> None:
         """
-        :param observations: Preprocessed flat observations of further steps, oldest first, ``[N, d_o]``
+        Append steps to the history.
+
+        :param observations: Preprocessed flat observations, oldest first, ``[N, d_o]``
         :param actions: The others' actions at those steps, ``[N, W]``, zero where not visible
         """
         if self.history is not None:
             history = append_rows(self.history, observations, actions)
             self.history_observations, self.history_actions, self.history_valid = history
 
-    @contextmanager
-    def conditioned(
-        self, noise: th.Tensor | None = None, kept: th.Tensor | None = None, sample: bool = False
-    ) -> Iterator[None]:
+    def forward(self, observations: th.Tensor | TensorDict, belief_pass: BeliefPass | None = None) -> BeliefFeatures:
         """
-        How the belief of the passes within is drawn.
+        Infer the belief and extract the features.
 
-        :param noise: The noise of eq. 5, ``[B, z]``
-        :param kept: The history rows to attend to, ``[B, N_h]``
-        :param sample: Whether to draw the noise
+        :param observations: Preprocessed observations
+        :param belief_pass: How to draw the belief; None for its mean
+        :return: Features and belief
         """
-        self.passing.given = (noise, kept, sample)
-        try:
-            yield
-        finally:
-            self.passing.given = (None, None, False)
-
-    def forward(self, observations: th.Tensor | TensorDict) -> BeliefFeatures:
-        noise, kept, sample = self.passing.given
+        belief_pass = belief_pass or BeliefPass()
         flat = flatten_observation(observations)
-        if sample:
-            noise = self.draw_noise(flat)
-        # Whoever acts asks for no prediction
-        output = self.infer(flat, noise, kept, predict=th.is_grad_enabled())
-        self.passing.output, self.passing.noise = output, noise
+        if belief_pass.sample:
+            belief_pass.noise = self.draw_noise(flat)
+        # While acting, no prediction is needed
+        output = self.infer(flat, belief_pass.noise, belief_pass.selected, predict=th.is_grad_enabled())
+        belief_pass.output = output
         return self.with_belief(self.features(observations), output)
 
     def draw_noise(self, flat: th.Tensor) -> th.Tensor | None:
         """
+        Draw the noise of eq. 5.
+
         :param flat: Preprocessed flat observations, ``[B, d_o]``
         :return: Noise for the beliefs about them, ``[B, z]``; None for a belief that does not sample
         """
@@ -161,46 +181,50 @@ class BeliefExtractor(BaseFeaturesExtractor):
 
     def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures:
         """
+        Put the belief beside the features.
+
         :param own: Features of the observation
-        :param output: The belief about it
-        :return: Both, as the options want the belief
+        :param output: The belief
+        :return: Both, the belief as the options want it
         """
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
         return BeliefFeatures(own, latent.detach() if self.options.detach_belief else latent)
 
     def infer(
-        self, flat: th.Tensor, noise: th.Tensor | None = None, kept: th.Tensor | None = None, predict: bool = True
+        self, flat: th.Tensor, noise: th.Tensor | None = None, selected: th.Tensor | None = None, predict: bool = True
     ) -> BeliefOutput:
         """
+        Infer the belief from the present history.
+
         :param flat: Preprocessed flat observations, ``[B, d_o]``
-        :param noise: The noise of eq. 5, ``[B, z]``; without it the belief is its mean
-        :param kept: The history rows to attend to, ``[B, N_h]``; without them the most similar ones
-        :param predict: Whether the others' actions are wanted
-        :return: The belief, from the present history
+        :param noise: The noise of eq. 5, ``[B, z]``; None for the mean of the belief
+        :param selected: The history rows to attend to, ``[B, N_h]``; None for the most similar ones
+        :param predict: Whether to predict the others' actions
+        :return: The belief
         """
         history = self.history
+        # An update changes the weights with each minibatch and needs their gradients, so it encodes the history each time
         context = None if history is None or th.is_grad_enabled() else self.encoded(history)
-        return self.belief(flat, history, noise, kept, context, predict)
+        return self.belief(flat, history, noise, selected, context, predict)
 
     def encoded(self, history: History) -> HistoryContext:
         """
-        Between two updates neither weights nor history change, so the encoded history is kept.
+        Return the encoded history. It is kept, because between two updates neither weights nor history change.
 
         :param history: The present one
         :return: The same as the network sees it, without gradients
         """
-        passing = self.passing
-        if passing.context_of.changed((*self.belief.context_parameters(), *history)) or passing.context is None:
-            passing.context = self.belief.encode_history(history)
-        return passing.context
+        if self._context_versions.changed((*self.belief.context_parameters(), *history)) or self._context is None:
+            self._context = self.belief.encode_history(history)
+        return self._context
 
 
 class BeliefFusion(nn.Module):
     """
-    Policy and value networks that fuse features and belief (Sec. 4.2): each has a base of its own on the features, beside
-    whose output the shared belief is put, and a linear layer. The paper lets another linear layer follow at once, which
-    would be one linear map; hence the activation between them.
+    Policy and value networks that fuse features and belief (Sec. 4.2): each has a base of its own on the features, whose
+    output is concatenated with the shared belief and fed to a linear layer. The paper lets another linear layer follow at
+    once, which would be one linear map; hence the activation between them.
 
     :param features_dim: Width of the features of the observation
     :param latent_dim: ``z``, width of the belief
@@ -230,20 +254,36 @@ class BeliefFusion(nn.Module):
 
     def forward(self, features: BeliefFeatures) -> tuple[th.Tensor, th.Tensor]:
         """
+        Fuse features and belief for policy and value.
+
         :param features: Output of :class:`BeliefExtractor`
         :return: Latent codes of policy and value
         """
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: BeliefFeatures) -> th.Tensor:
+        """
+        Fuse features and belief for the policy.
+
+        :param features: Output of :class:`BeliefExtractor`
+        :return: Latent code of the policy
+        """
         return self.activation(self.fuse_pi(th.cat([self.base.forward_actor(features.own), features.latent], dim=-1)))
 
     def forward_critic(self, features: BeliefFeatures) -> th.Tensor:
+        """
+        Fuse features and belief for the value.
+
+        :param features: Output of :class:`BeliefExtractor`
+        :return: Latent code of the value
+        """
         return self.activation(self.fuse_vf(th.cat([self.base.forward_critic(features.own), features.latent], dim=-1)))
 
     def belief_share(self) -> float:
         """
-        :return: Summed absolute fusion weights on the belief over those on everything, in [0, 1] (Fig. 5e of the paper)
+        Return how much the fusion weighs the belief (Fig. 5e of the paper).
+
+        :return: Summed absolute fusion weights on the belief over those on everything, in [0, 1]
         """
         with th.no_grad():
             weights = [self.fuse_pi.weight.abs(), self.fuse_vf.weight.abs()]

@@ -1,7 +1,7 @@
 """What a model knows of the others: how their actions are flattened into one vector, and how to read them from `info`."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -64,33 +64,3 @@ def others_of(env: VecEnv) -> ActionSpaces:
     """
     # Asked first, because a worker process does not survive being asked for what it does not have
     return dict(env.get_attr("others_action_spaces")[0]) if env.has_attr("others_action_spaces") else {}
-
-
-def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
-    """
-    :param infos: One step's `info` of each env copy
-    :param layout: Whose actions are expected
-    :return: The others' actions, float32 ``[n_envs, W]``, zero where not visible, and visibility, bool
-        ``[n_envs, n_others]``. Zeroed here once more, so that a careless environment cannot leak what the agent did not see
-    """
-    actions = _rows("others_actions", layout.width, infos).astype(np.float32, copy=False)
-    visible = _rows("others_visible", layout.n_others, infos).astype(bool, copy=False)
-    return np.where(visible.take(layout.owners, axis=1), actions, np.float32(0.0)), visible
-
-
-def _rows(key: str, width: int, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    try:
-        rows = [np.asarray(info[key]) for info in infos]
-    except KeyError:
-        raise ValueError(
-            f"the environment names others in 'others_action_spaces', but its info lacks {key!r}; every step must bring "
-            "'others_actions' and 'others_visible' (a Team provides both)"
-        ) from None
-    wrong = {row.shape for row in rows} - {(width,)}
-    if wrong:
-        raise ValueError(
-            f"info brings {key} of shape {sorted(wrong)[0]}; the others' action spaces ask for {(width,)}, see "
-            "sb3_belief.belief_ppo.others.action_layout (actions) and one truth value for each other (visible)"
-        )
-    # A third of the time of stack()
-    return np.concatenate(rows).reshape(len(rows), width)

@@ -2,54 +2,57 @@
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
-from numbers import Integral
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from torch import nn
+from torch.autograd.graph import increment_version
 from torch.distributions import Distribution
 
-from sb3_belief.belief import ACTION_LOSSES, DynamicBelief, History, expected_actions, kl_divergence
-from sb3_belief.belief_ppo.buffers import BeliefMinibatch
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, flat_observations
-from sb3_belief.belief_ppo.loss_injection import add_loss
-from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
-from sb3_belief.belief_ppo.others import OthersPrediction, action_layout
-from sb3_belief.belief_ppo.terminal_values import TerminalValues
-from sb3_belief.common.tensor_version import count_fused_step
-
-if TYPE_CHECKING:
-    _Policy = ActorCriticPolicy
-else:
-    _Policy = object
-
-# The least height and width that NatureCNN's convolutions leave anything of
-_MIN_IMAGE_SIZE = 36
+from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, DynamicBelief, History, expected_actions, kl_divergence
+from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass, flat_observations
+from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
+from sb3_belief.belief_ppo.others import OthersPrediction
 
 
-def _fast_adam(optimizer_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
+class _FastAdam:
     """
-    One call for all weights instead of ten for each of these many small ones: the same step to the last bits, faster.
-
-    :param optimizer_kwargs: What the user says of Adam; None: SB3's default
-    :return: The same with the fused implementation, unless the user has chosen another
+    PyTorch's fused Adam: one call for all weights instead of ten for each of these many small ones, with the same step to the
+    last bits.
     """
-    given = {"eps": 1e-5} if optimizer_kwargs is None else dict(optimizer_kwargs)
-    chosen = given.keys() & {"fused", "foreach", "capturable", "differentiable"}
-    return given if chosen else {**given, "fused": True}
+
+    @staticmethod
+    def kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Add the fused implementation to Adam's arguments, unless the user has chosen another.
+
+        :param optimizer_kwargs: The user's arguments, or SB3's
+        """
+        chosen = optimizer_kwargs.keys() & {"fused", "foreach", "capturable", "differentiable"}
+        return dict(optimizer_kwargs) if chosen else {**optimizer_kwargs, "fused": True}
+
+    @staticmethod
+    def count_step(optimizer: th.optim.Optimizer, *_: Any) -> None:
+        """
+        Increment the version counters of the weights, which a fused step does not: what was computed from them is stale.
+
+        :param optimizer: Has made a step, of which this is the hook
+        """
+        for group in optimizer.param_groups:
+            for weights in group["params"] if group.get("fused") else ():
+                increment_version(weights)
 
 
 class _Unchecked:
     """
-    Lets torch's distributions leave out their checks, a fifth of a pass through a small network. Drawing from a discrete one
-    notices numbers that are none (NaN) by itself.
+    Lets torch's distributions leave out their checks, a fifth of a pass through a small network. Drawing from a discrete
+    distribution notices NaN by itself.
     """
 
     def __enter__(self) -> None:
@@ -60,137 +63,58 @@ class _Unchecked:
         Distribution.set_default_validate_args(self._before)
 
 
-class BeliefPolicyMixin(_Policy):
+class _AddLoss(th.autograd.Function):
+    """The identity on ``values``, whose backward pass also hands ``loss`` a gradient of one."""
+
+    @staticmethod
+    def forward(ctx: Any, values: th.Tensor, loss: th.Tensor) -> th.Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        (grad_values,) = grad_outputs
+        return grad_values, grad_values.new_ones(())
+
+
+def add_loss(values: th.Tensor, loss: th.Tensor) -> th.Tensor:
     """
-    Makes an SB3 actor-critic policy one with a belief. All of SB3's own passes (`forward`, `evaluate_actions`,
-    `get_distribution`, `predict_values`) go through the features extractor, so that is where the belief is inferred, once a
-    pass, for policy and value alike; what is left here is to say how it is drawn.
+    Let ``loss`` be minimised together with whatever is computed from ``values``.
 
-    :param observation_space: As in SB3
-    :param action_space: As in SB3
-    :param lr_schedule: As in SB3
-    :param features_extractor_class: As in SB3; None for the policy's usual one
-    :param others_action_spaces: The others' action spaces in their fixed order; none without others
-    :param belief: As in :class:`~sb3_belief.BeliefPPO`; with ``"none"``, and without others, this is SB3's policy
-    :param history_length: As in :class:`~sb3_belief.BeliefPPO`
-    :param keep_ratio: As in :class:`~sb3_belief.BeliefPPO`
-    :param action_loss: As in :class:`~sb3_belief.BeliefPPO`
-    :param policy_latent: As in :class:`~sb3_belief.BeliefPPO`
-    :param similarity: As in :class:`~sb3_belief.BeliefPPO`
-    :param detach_belief: As in :class:`~sb3_belief.BeliefPPO`
-    :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
-    :param latent_dim: ``z``, width of the belief
-    :param fusion_activation_fn: Activation after policy and value have fused the belief
+    SB3's PPO asks the policy for the values of a minibatch, builds its own loss from them, and calls ``backward()`` once on
+    it. That pass goes through the values exactly once, whatever the value coefficient; there the loss joins with the weight
+    one. The gradient equals that of the explicit sum ``loss_of_PPO + loss``, and SB3's own gradient clipping, schedules and
+    early stopping apply to it. So ``train()`` need not be copied, and cannot drift from SB3's.
+
+    :param values: Values as the policy returns them, in the graph that is differentiated
+    :param loss: A scalar
+    :return: The same values
+    """
+    return _AddLoss.apply(values, loss)
+
+
+class BeliefPolicyMixin(BeliefNetworksMixin):
+    """
+    Makes an SB3 actor-critic policy one with a belief.
+
+    All of SB3's own passes (`forward`, `evaluate_actions`, `get_distribution`, `predict_values`) go through the features
+    extractor, so the belief is inferred there, once a pass, for policy and value alike. What is left here is to say how it is
+    drawn, and to add its loss.
     """
 
-    #: The features extractor if the user names none; None for the one that fits the observation space
-    default_extractor: ClassVar[type[BaseFeaturesExtractor] | None] = None
+    #: Weights of the two terms of the belief's loss (eq. 8), set by the algorithm before each update
+    action_coef: float = 0.5
+    kl_coef: float = 0.005
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
-        lr_schedule: Schedule,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
-        others_action_spaces: Mapping[str, spaces.Space] | None = None,
-        belief: str = "dynamic",
-        history_length: int = 800,
-        keep_ratio: float = 0.05,
-        action_loss: str = "mse",
-        policy_latent: str = "sample",
-        similarity: str = "embedding",
-        detach_belief: bool = False,
-        embedding_dim: int = EMBEDDING_DIM,
-        latent_dim: int = LATENT_DIM,
-        fusion_activation_fn: type[nn.Module] = nn.ReLU,
-        **kwargs: Any,
-    ) -> None:
-        # All this before SB3's constructor, which builds the networks
-        self.options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
-        for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
-            if not isinstance(width, Integral) or width < 1:
-                raise ValueError(f"{name} is {width!r}; it must be an integer of at least 1")
-        self.others_action_spaces = dict(others_action_spaces or {})
-        self.embedding_dim = embedding_dim
-        self.latent_dim = latent_dim
-        self.fusion_activation_fn = fusion_activation_fn
-        self.layout = action_layout(self.others_action_spaces)
-        self.options.check_others(self.others_action_spaces, self.layout)
-        self.has_belief = self.options.variant is not None and self.layout.n_others > 0
-        #: Weights of the two terms of the belief's loss (eq. 8), set by the algorithm before each update
-        self.action_coef = 0.5
-        self.kl_coef = 0.005
-        self._minibatch: BeliefMinibatch | None = None
-        self.terminal_values = TerminalValues()
-        if features_extractor_class is None:
-            features_extractor_class = self.default_extractor or fitting_extractor(observation_space)
-        kwargs["features_extractor_class"] = features_extractor_class
-        if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
-            kwargs["optimizer_kwargs"] = _fast_adam(kwargs.get("optimizer_kwargs"))
-        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
-        self.optimizer.register_step_post_hook(count_fused_step)
-        if self.has_belief and not self.share_features_extractor:
-            raise ValueError(
-                "share_features_extractor=False would give the value a belief of its own; policy and value share the belief "
-                "(Sec. 4.2 of the paper). Leave it True, or use belief='none'."
-            )
+    def _build(self, lr_schedule: Schedule) -> None:
+        if self.optimizer_class is th.optim.Adam:
+            self.optimizer_kwargs = _FastAdam.kwargs(self.optimizer_kwargs)
+        super()._build(lr_schedule)
+        self.optimizer.register_step_post_hook(_FastAdam.count_step)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         # A copied optimiser has no hooks
-        self.optimizer.register_step_post_hook(count_fused_step)
-
-    # -- construction, within SB3's constructor ------------------------------------------------------------------------
-
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        features = super().make_features_extractor()
-        if not self.has_belief:
-            return features
-        # A stream aside: with the same seed, all variants of a belief begin with the same weights beside it
-        with th.random.fork_rng(devices=[]):
-            belief = DynamicBelief(
-                get_flattened_obs_dim(self.observation_space),
-                self.layout.width,
-                self.embedding_dim,
-                self.latent_dim,
-                self.options.keep_ratio,
-                self.options.belief,
-                self.options.similarity,
-            )
-        return BeliefExtractor(self.observation_space, features, belief, self.options)
-
-    def _build_mlp_extractor(self) -> None:
-        if not self.has_belief:
-            super()._build_mlp_extractor()
-            return
-        self.mlp_extractor = BeliefFusion(  # type: ignore[assignment]
-            self._extractor.features.features_dim,
-            self.latent_dim,
-            self.net_arch,
-            self.activation_fn,
-            self.fusion_activation_fn,
-            self.device,
-        )
-
-    def init_weights(self, module: nn.Module, gain: float = 1) -> None:  # type: ignore[override]
-        """
-        SB3 initialises every layer of a features extractor orthogonally with a gain of sqrt(2), which is meant for layers
-        before a ReLU: not for the belief's queries, keys and log deviations, which keep PyTorch's initialisation.
-        """
-        if not (self.has_belief and any(module is layer for layer in self._extractor.belief.modules())):
-            super().init_weights(module, gain)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            **super()._get_constructor_parameters(),
-            "share_features_extractor": self.share_features_extractor,  # SB3 forgets it
-            **asdict(self.options),
-            "others_action_spaces": self.others_action_spaces,
-            "embedding_dim": self.embedding_dim,
-            "latent_dim": self.latent_dim,
-            "fusion_activation_fn": self.fusion_activation_fn,
-        }
+        self.optimizer.register_step_post_hook(_FastAdam.count_step)
 
     # -- what the algorithm uses ---------------------------------------------------------------------------------------
 
@@ -230,24 +154,6 @@ class BeliefPolicyMixin(_Policy):
             )
         self._extractor.remember(rows, th.as_tensor(actions, device=self.device))
 
-    def stage(self, minibatch: BeliefMinibatch | None) -> None:
-        """
-        :param minibatch: What the next call of :meth:`evaluate_actions` is about; it is used once
-        """
-        self._minibatch = minibatch
-
-    @property
-    def acted_with(self) -> tuple[th.Tensor, th.Tensor] | None:
-        """
-        Noise ``[B, z]`` and history rows ``[B, N_h]`` of the last call of :meth:`forward`; of width 0 for a belief that does
-        not sample, or does not attend; None without a belief. Can be set, for a call that was made in another process.
-        """
-        return self._extractor.passing.acted_with if self.has_belief else None
-
-    @acted_with.setter
-    def acted_with(self, noise_and_rows: tuple[th.Tensor, th.Tensor]) -> None:
-        self._extractor.passing.acted_with = noise_and_rows
-
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
         :param observations: Observations as the environment gives them, batch first
@@ -258,67 +164,145 @@ class BeliefPolicyMixin(_Policy):
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 
     def _distributions(self, trusted: bool = True) -> AbstractContextManager[None]:
-        """How torch's distributions are made within a pass."""
+        """Return the context in which the distributions of a pass are made."""
         return _Unchecked() if trusted and not isinstance(self.action_space, spaces.Box) else nullcontext()
 
+    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
+        """
+        Extract features as SB3 does, with the belief drawn as the :class:`BeliefPass` says that is attached to the
+        observations.
+
+        :param obs: Observations; without a pass attached the belief is its mean
+        :param features_extractor: As in SB3
+        :return: Features and belief
+        """
+        belief_pass = attached(obs)
+        if isinstance(belief_pass, BeliefPass):
+            features_extractor = partial(self._extractor, belief_pass=belief_pass)
+        return super().extract_features(obs, features_extractor)
+
     def forward(self, obs: Any, deterministic: bool = False, *args: Any, **kwargs: Any) -> Any:
+        """
+        Choose actions as SB3 does.
+
+        :param obs: Observations
+        :param deterministic: Whether belief and action are their distributions' means or modes instead of samples
+        :param args: As in SB3 or sb3-contrib
+        :param kwargs: As in SB3 or sb3-contrib
+        :return: Actions, values and log probabilities. A :class:`~sb3_belief.belief_ppo.buffers.SampledLatents` is attached to
+            the values, for the rollout buffer
+        """
         if not self.has_belief:
             with self._distributions(trusted=not deterministic):
                 return super().forward(obs, deterministic, *args, **kwargs)
-        extractor = self._extractor
-        with extractor.conditioned(sample=not deterministic), self._distributions(trusted=not deterministic):
-            result = super().forward(obs, deterministic, *args, **kwargs)
-        output, noise = extractor.passing.output, extractor.passing.noise
+        belief_pass = BeliefPass(sample=not deterministic)
+        with self._distributions(trusted=not deterministic):
+            actions, values, log_prob = super().forward(attach(obs, belief_pass), deterministic, *args, **kwargs)
+        output, noise = belief_pass.output, belief_pass.noise
         assert output is not None
         if noise is None:
-            noise = th.zeros_like(output.mean if extractor.belief.variant.samples else output.mean[:, :0])
-        self.acted_with = noise, output.kept
-        return result
+            noise = th.zeros_like(output.mean if self._extractor.belief.variant.samples else output.mean[:, :0])
+        return actions, attach(values, SampledLatents(noise, output.selected)), log_prob
 
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False, *args: Any, **kwargs: Any) -> th.Tensor:
-        if not self.has_belief:
+    def _predict(self, observation: Any, deterministic: bool = False, *args: Any, **kwargs: Any) -> th.Tensor:
+        if not self.has_belief or deterministic:
             return super()._predict(observation, deterministic, *args, **kwargs)
-        with self._extractor.conditioned(sample=not deterministic):
-            return super()._predict(observation, deterministic, *args, **kwargs)
+        # SB3 uses get_distribution() here, which reaches the extractor without a pass: the belief would be its mean
+        return super().forward(attach(observation, BeliefPass(sample=True)), deterministic, *args, **kwargs)[0]
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """
+        Convert observations as SB3 does, keeping a value that is attached to them (see :meth:`attach_terminal_values`).
+
+        :param observation: As in SB3
+        :return: As in SB3
+        """
+        tensor, vectorized = super().obs_to_tensor(observation)
+        value = attached(observation)
+        return (tensor if value is None else attach(tensor, value)), vectorized
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
-        value = self.terminal_values.take(obs)
-        return super().predict_values(obs) if value is None else value
+        """
+        Predict values as SB3 does, unless they are known already.
+
+        :param obs: Observations
+        :return: Values, ``[B, 1]``
+        """
+        value = attached(obs)
+        return value if isinstance(value, th.Tensor) else super().predict_values(obs)
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
-        minibatch, self._minibatch = self._minibatch, None
-        if not self.has_belief or minibatch is None:
+        """
+        Evaluate actions as SB3 does. With a :class:`~sb3_belief.belief_ppo.buffers.BeliefMinibatch` attached to the
+        observations the belief is that with which the agent acted, and the terms of eq. 8 that train it join the loss:
+
+            ``L = L_PPO + action_coef * action error + kl_coef * KL divergence``
+
+        :param obs: Observations
+        :param actions: As in SB3
+        :param args: As in SB3 or sb3-contrib
+        :param kwargs: As in SB3 or sb3-contrib
+        :return: Values, log likelihood and entropy of the actions
+        """
+        minibatch = attached(obs)
+        if not (self.has_belief and isinstance(minibatch, BeliefMinibatch)):
             with self._distributions():
                 return super().evaluate_actions(obs, actions, *args, **kwargs)
-        extractor = self._extractor
-        with extractor.conditioned(minibatch.noise, minibatch.kept), self._distributions():
-            values, log_prob, entropy = super().evaluate_actions(obs, actions, *args, **kwargs)
-        loss = self.belief_loss(minibatch)
-        extractor.passing.output = None  # it holds the graph of this minibatch
+        belief_pass = BeliefPass(minibatch.noise, minibatch.selected)
+        with self._distributions():
+            # What L_PPO is computed from
+            values, log_prob, entropy = super().evaluate_actions(attach(obs, belief_pass), actions, *args, **kwargs)
+        assert belief_pass.output is not None
+        loss = self.belief_loss(belief_pass.output, minibatch)
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 
-    def belief_loss(self, minibatch: BeliefMinibatch) -> th.Tensor | None:
+    def belief_loss(self, belief: BeliefOutput, minibatch: BeliefMinibatch) -> th.Tensor | None:
         """
-        :param minibatch: The minibatch whose belief the extractor has inferred last
-        :return: The terms of eq. 8 that train the belief, a scalar; None if there are none
+        Return the terms of eq. 8 that train the belief.
+
+        :param belief: The belief about the minibatch
+        :param minibatch: What the others did
+        :return: A scalar; None for a belief that predicts nothing
         """
-        output, variant = self._extractor.passing.output, self.options.variant
-        assert output is not None and variant is not None
-        if output.prediction is None:
+        if belief.prediction is None:
             return None
-        loss = self.action_coef * self.action_error(output.prediction, minibatch)
-        if variant.samples:
-            loss = loss + self.kl_coef * kl_divergence(output.mean, output.log_std)
+        loss = self.action_coef * self.action_error(belief.prediction, minibatch)
+        if self._extractor.belief.variant.samples:
+            loss = loss + self.kl_coef * kl_divergence(belief.mean, belief.log_std)
         return loss
 
     def action_error(self, prediction: th.Tensor, minibatch: BeliefMinibatch) -> th.Tensor:
         """
+        Return the error of the predicted actions.
+
         :param prediction: Predicted actions of the others in the minibatch, ``[B, W]``
         :param minibatch: Their actions and visibility
         :return: Eq. 7, or the cross-entropy in its place, a scalar
         """
         loss = ACTION_LOSSES[self.options.action_loss]
         return loss(prediction, minibatch.others_actions, minibatch.others_visible, self.layout)
+
+    def attach_terminal_values(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
+        """
+        Compute the values from which SB3 bootstraps at time limits, for all copies in one pass.
+
+        SB3 asks for them one copy after the other: in environments whose copies end together that is a tenth of a rollout. The
+        values travel with the terminal observations, through :meth:`obs_to_tensor` to :meth:`predict_values`.
+
+        :param infos: One step's `info` of each copy; their terminal observations are replaced by equal ones that carry a value
+        :param dones: Which copies ended with this step, bool ``[n_envs]``
+        """
+        ended = [info for info, done in zip(infos, dones, strict=False) if done and info.get("TimeLimit.truncated", False)]
+        ended = [info for info in ended if info.get("terminal_observation") is not None]
+        # For a single one nothing is gained
+        if len(ended) < 2:
+            return
+        rows = [info["terminal_observation"] for info in ended]
+        batch = {key: np.stack([row[key] for row in rows]) for key in rows[0]} if isinstance(rows[0], dict) else np.stack(rows)
+        with th.no_grad():
+            values = self.predict_values(self.obs_to_tensor(batch)[0])
+        for i, info in enumerate(ended):
+            info["terminal_observation"] = attach(rows[i], values[i : i + 1])
 
     # -- a belief one can look at --------------------------------------------------------------------------------------
 
@@ -350,23 +334,9 @@ class BeliefPolicyMixin(_Policy):
             {name: shown(expected[:, self.layout.columns_of(i)]) for i, name in enumerate(self.others_action_spaces)},
             shown(output.mean),
             shown(output.log_std.exp()),
-            shown(output.kept),
+            shown(output.selected),
             shown(output.weights),
         )
-
-
-def fitting_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-    """
-    :param observation_space: Of the agent
-    :return: The features extractor of that one of SB3's policies that is meant for it
-    """
-    if isinstance(observation_space, spaces.Dict):
-        return CombinedExtractor
-    if is_image_space(observation_space):
-        _, height, width = observation_space.shape  # type: ignore[misc]
-        if min(height, width) >= _MIN_IMAGE_SIZE:
-            return NatureCNN
-    return FlattenExtractor
 
 
 class BeliefActorCriticPolicy(BeliefPolicyMixin, ActorCriticPolicy):

@@ -11,7 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from sb3_belief.envs.random_play import PlayRecord, RandomPlayer, play_randomly
 from sb3_belief.envs.registry import spec
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
-from sb3_belief.vec_env.team_vec_env import check_spaces
+from sb3_belief.vec_env.validation import check_spaces
 
 
 @dataclass(frozen=True)

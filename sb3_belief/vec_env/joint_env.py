@@ -286,6 +286,27 @@ class JointEnv(gym.Env):
         return {"action_masks": np.concatenate(masks)}
 
 
+def step_and_reset(
+    env: JointEnv, action: dict[str, Any]
+) -> tuple[dict[str, np.ndarray], float, bool, StepRecord, np.ndarray | None, dict[str, Any]]:
+    """
+    :param env: a copy
+    :param action: by agent
+    :return: observations, reward, whether an episode has ended, what there is to say about the step, the masks for the next
+        actions, and what else the infos hold; the observations and masks are the new episode's where one has ended
+    """
+    obs, reward, terminated, truncated, info = env.step(action)
+    record: StepRecord = info.pop("joint")
+    masks, done = record.action_masks, terminated or truncated
+    if done:
+        info["TimeLimit.truncated"] = truncated and not terminated
+        # The environment may use its arrays again
+        info["terminal_observation"] = {agent: np.array(part) for agent, part in obs.items()}
+        obs, reset_info = env.reset()
+        masks = reset_info.get("action_masks")
+    return obs, reward, done, record, masks, info
+
+
 def _no_flags(n_agents: int) -> Flags:
     return np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool)
 

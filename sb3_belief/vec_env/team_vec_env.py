@@ -3,7 +3,7 @@
 import os
 import time
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -12,6 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
 TeamStep: TypeAlias = tuple[TeamObs, np.ndarray, np.ndarray, list[dict[str, Any]]]
@@ -223,7 +225,7 @@ class TeamVecEnv(VecEnv):
                 f" {self.possible_agents}, not {type(actions).__name__}."
             )
         if actions.keys() != self._action_shapes.keys():
-            missing, unknown = _difference(self.possible_agents, actions)
+            missing, unknown = difference(self.possible_agents, actions)
             raise ValueError(
                 f"Each agent needs an action: missing {missing}, unknown {unknown}; the agents are {self.possible_agents}."
             )
@@ -235,55 +237,3 @@ class TeamVecEnv(VecEnv):
                     f" got {checked[agent].shape}."
                 )
         return checked
-
-
-def _difference(expected: Sequence[str], given: Iterable[str]) -> tuple[list[str], list[str]]:
-    """
-    :return: what is missing in ``given``, and what is not expected there
-    """
-    given = list(given)
-    return [name for name in expected if name not in given], [name for name in given if name not in expected]
-
-
-def check_spaces(
-    agents: Sequence[str],
-    observation_spaces: Mapping[str, spaces.Space],
-    action_spaces: Mapping[str, spaces.Space],
-    scripted_action_spaces: Mapping[str, spaces.Space],
-) -> None:
-    """
-    :param agents: names of the agents
-    :param observation_spaces: of all agents
-    :param action_spaces: of all agents
-    :param scripted_action_spaces: of the scripted others
-    :raises ValueError: for names or spaces that a team cannot have
-    """
-    if not agents or len(set(agents)) != len(agents):
-        raise ValueError(f"possible_agents must be one or more different names, got {agents}.")
-    for name, given in (("observation_spaces", observation_spaces), ("action_spaces", action_spaces)):
-        missing, unknown = _difference(agents, given)
-        if missing or unknown:
-            raise ValueError(f"{name} must have a space for each of {agents}: missing {missing}, unknown {unknown}.")
-    allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
-    kinds = ", ".join(kind.__name__ for kind in allowed)
-    for agent in agents:
-        if isinstance(observation_spaces[agent], (spaces.Dict, spaces.Tuple)):
-            raise ValueError(
-                f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
-                " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
-            )
-        if not isinstance(observation_spaces[agent], allowed):
-            raise ValueError(f"The observation space of {agent!r} is {observation_spaces[agent]}; allowed are {kinds}.")
-    both = [name for name in scripted_action_spaces if name in agents]
-    if both:
-        raise ValueError(
-            f"scripted_action_spaces has entries for {both}, which are agents: a scripted other does not learn, so its name"
-            f" must differ from the agents' {list(agents)}."
-        )
-    for name, space in {**action_spaces, **scripted_action_spaces}.items():
-        if not isinstance(space, allowed):
-            raise ValueError(f"The action space of {name!r} is {space}; allowed are {kinds}.")
-        if np.any(getattr(space, "start", 0)):
-            raise ValueError(
-                f"The action space of {name!r} is {space}: SB3 numbers actions from 0, so the environment must too (start=0)."
-            )

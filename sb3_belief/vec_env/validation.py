@@ -1,4 +1,4 @@
-"""What environments and actors can get wrong while they run: found where it happens, and said with agent, copy and step."""
+"""Checks of what a team's environment declares and returns, with messages that name agent, copy and step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -9,17 +9,78 @@ from gymnasium import spaces
 
 def place(copy: int, step: int) -> str:
     """
-    :param copy: number of the environment copy, from 0
-    :param step: number of the step in the episode, from 1; 0: its reset
-    :return: these in words
+    Return where something happened, in words.
+
+    :param copy: Number of the environment copy, from 0
+    :param step: Number of the step in the episode, from 1; 0 for its reset
     """
     return f"in environment copy {copy} at " + (f"step {step}" if step else "reset")
 
 
+def check_spaces(
+    agents: Sequence[str],
+    observation_spaces: Mapping[str, spaces.Space],
+    action_spaces: Mapping[str, spaces.Space],
+    scripted_action_spaces: Mapping[str, spaces.Space],
+) -> None:
+    """
+    Check names and spaces.
+
+    :param agents: Names of the agents
+    :param observation_spaces: Observation spaces by agent
+    :param action_spaces: Action spaces by agent
+    :param scripted_action_spaces: Action spaces of the scripted others
+    :raises ValueError: For names or spaces that a team cannot have
+    """
+    if not agents or len(set(agents)) != len(agents):
+        raise ValueError(f"possible_agents must be one or more different names, got {agents}.")
+    for name, given in (("observation_spaces", observation_spaces), ("action_spaces", action_spaces)):
+        missing, unknown = difference(agents, given)
+        if missing or unknown:
+            raise ValueError(f"{name} must have a space for each of {agents}: missing {missing}, unknown {unknown}.")
+    allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
+    kinds = ", ".join(kind.__name__ for kind in allowed)
+    for agent in agents:
+        if isinstance(observation_spaces[agent], (spaces.Dict, spaces.Tuple)):
+            raise ValueError(
+                f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
+                " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
+            )
+        if not isinstance(observation_spaces[agent], allowed):
+            raise ValueError(f"The observation space of {agent!r} is {observation_spaces[agent]}; allowed are {kinds}.")
+    both = [name for name in scripted_action_spaces if name in agents]
+    if both:
+        raise ValueError(
+            f"scripted_action_spaces has entries for {both}, which are agents: a scripted other does not learn, so its name"
+            f" must differ from the agents' {list(agents)}."
+        )
+    for name, space in {**action_spaces, **scripted_action_spaces}.items():
+        if not isinstance(space, allowed):
+            raise ValueError(f"The action space of {name!r} is {space}; allowed are {kinds}.")
+        if np.any(getattr(space, "start", 0)):
+            raise ValueError(
+                f"The action space of {name!r} is {space}: SB3 numbers actions from 0, so the environment must too (start=0)."
+            )
+
+
+def difference(expected: Sequence[str], given: Iterable[str]) -> tuple[list[str], list[str]]:
+    """
+    Compare names.
+
+    :param expected: The names that there should be
+    :param given: The names that there are
+    :return: The names that are missing, and those that are not expected
+    """
+    given = list(given)
+    return [name for name in expected if name not in given], [name for name in given if name not in expected]
+
+
 def check_wrappers(env: Any) -> None:
     """
-    :param env: a ``ParallelEnv``, with or without wrappers
-    :raises ValueError: for a wrapper that hides what a team has to know
+    Check the wrappers of an environment.
+
+    :param env: A ``ParallelEnv``, with or without wrappers
+    :raises ValueError: For a wrapper that hides what a team has to know
     """
     while env is not None:
         if type(env).__name__ == "black_death_par":
@@ -28,7 +89,7 @@ def check_wrappers(env: Any) -> None:
                 " terminated or were cut by a limit. A team does its work: who leaves early stays a member with a zero"
                 " observation, and is known to be inactive. Leave it out."
             )
-        # "aec_env": below a conversion from AEC
+        # A conversion from AEC holds its environment under "aec_env"
         env = vars(env).get("env") or vars(env).get("aec_env")
 
 
@@ -36,12 +97,14 @@ def check_names(
     agents: Sequence[str], before: Iterable[str], after: Iterable[str], given: Mapping[str, Mapping[str, Any]], where: str
 ) -> None:
     """
+    Check the names of agents in what an environment returned.
+
     :param agents: ``possible_agents`` as they were when the environment was made
-    :param before: who acted
-    :param after: who is in play now
-    :param given: {what the environment returned: its dictionary by agent}
-    :param where: copy and step in words
-    :raises ValueError: if an unknown agent appears, or one in play was given nothing
+    :param before: The agents that acted
+    :param after: The agents that are in play now
+    :param given: What the environment returned: its dicts by agent, each under its own name
+    :param where: Copy and step, in words
+    :raises ValueError: If an unknown agent appears, or one that is in play got nothing
     """
     found = {"agents": after, **given}
     for name, names in found.items():
@@ -64,11 +127,13 @@ def check_names(
 
 def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -> None:
     """
-    :param agent: its name
-    :param value: its observation
-    :param space: what it should lie in
-    :param where: copy and step in words
-    :raises ValueError: if shape or numbers are not those of an observation
+    Check one observation.
+
+    :param agent: Name of the agent
+    :param value: Its observation
+    :param space: Its observation space
+    :param where: Copy and step, in words
+    :raises ValueError: If shape or numbers are not those of an observation
     """
     array = np.asarray(value)
     if array.shape != space.shape or array.dtype.kind not in "biuf":
@@ -76,16 +141,17 @@ def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -
             f"The observation of {agent!r} {where} has the shape {array.shape} and type {array.dtype}, but its observation"
             f" space is {space}: return an array of that shape, or correct observation_space({agent!r})."
         )
-    if array.dtype.kind == "f" and not _finite(array):
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise not_finite(f"observation of {agent!r}", array, where)
 
 
 def not_finite(what: str, values: np.ndarray, where: str) -> ValueError:
     """
-    :param what: whose and which numbers
-    :param values: with one that is not finite
-    :param where: copy and step in words
-    :return: the error to raise
+    Return the error for a number that is not finite.
+
+    :param what: What the numbers are, and of which agent
+    :param values: The numbers
+    :param where: Copy and step, in words
     """
     index = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
     at = f" (index {', '.join(map(str, index))})" if index else ""
@@ -93,118 +159,3 @@ def not_finite(what: str, values: np.ndarray, where: str) -> ValueError:
         f"The {what} {where} holds {values[index]}{at}: a network that learns from it is lost. Look for a division by zero, a"
         " root or a logarithm there, or clip what can grow without bound."
     )
-
-
-class StepChecks:
-    """
-    Checks of joint steps of all copies at once. They look for a sign that anything is wrong, which costs next to nothing, and
-    only then for what it is.
-
-    :param agents: names of the agents
-    :param observation_spaces: by agent
-    :param action_spaces: by agent
-    :param mask_widths: of each agent, in order; 0: it cannot be masked
-    """
-
-    def __init__(
-        self,
-        agents: Sequence[str],
-        observation_spaces: Mapping[str, spaces.Space],
-        action_spaces: Mapping[str, spaces.Space],
-        mask_widths: Sequence[int],
-    ):
-        self._agents, self._action_spaces = list(agents), action_spaces
-        self._floats = [agent for agent in agents if np.issubdtype(observation_spaces[agent].dtype, np.floating)]
-        self._bounds = {agent: _bounds(action_spaces[agent]) for agent in agents}
-        self._masked = [agent for agent, width in zip(agents, mask_widths, strict=True) if width]
-        self._mask_starts = [sum(mask_widths[:i]) for i, width in enumerate(mask_widths) if width]
-
-    def number(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> list[int]:
-        """
-        :param agent: one with a ``Discrete`` action space
-        :param chosen: its actions [num_envs]
-        :param steps: how many steps each copy's episode has had, int [num_envs]
-        :return: the actions as plain integers
-        :raises ValueError: if one is not in its space
-        """
-        numbers = chosen.tolist()
-        if chosen.dtype.kind not in "iub" or min(numbers) < 0 or max(numbers) > self._bounds[agent][1]:
-            self._refuse_action(agent, chosen, steps)
-        return numbers
-
-    def vector(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """
-        :param agent: one with another action space
-        :param chosen: its actions [num_envs, ...]
-        :param steps: how many steps each copy's episode has had, int [num_envs]
-        :return: the actions
-        :raises ValueError: if one is not in its space
-        """
-        low, high = self._bounds[agent]
-        if not ((chosen >= low) & (chosen <= high)).all():
-            self._refuse_action(agent, chosen, steps)
-        return chosen
-
-    def _refuse_action(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> None:
-        low, high = self._bounds[agent]
-        fits = ((chosen >= low) & (chosen <= high)).reshape(len(chosen), -1).all(axis=1)
-        # Where all do, it is their type
-        copy = int(np.argmin(fits))
-        raise ValueError(
-            f"The action of {agent!r} {place(copy, int(steps[copy]) + 1)} is {chosen[copy].tolist()!r} (type {chosen.dtype}),"
-            f" which is not in its action space {self._action_spaces[agent]}. An SB3 model's own actions are; clip or convert"
-            " others."
-        )
-
-    def numbers(self, obs: Mapping[str, np.ndarray], rewards: np.ndarray, steps: np.ndarray) -> None:
-        """
-        :param obs: {agent: array [num_envs, ...]}
-        :param rewards: of the agents, float32 [num_envs, n]
-        :param steps: how many steps each copy's episode has had, int [num_envs]
-        :raises ValueError: if one is not finite
-        """
-        for agent in self._floats:
-            if not _finite(obs[agent]):
-                copy = int(np.argmin(np.isfinite(obs[agent]).reshape(len(steps), -1).all(axis=1)))
-                raise not_finite(f"observation of {agent!r}", obs[agent][copy], place(copy, int(steps[copy]) + 1))
-        if not _finite(rewards):
-            copy, i = (int(k) for k in np.argwhere(~np.isfinite(rewards))[0])
-            raise not_finite(f"reward of {self._agents[i]!r}", rewards[copy, i], place(copy, int(steps[copy]) + 1))
-
-    def masks(self, masks: np.ndarray, steps: np.ndarray) -> None:
-        """
-        :param masks: of all agents one after the other, bool [num_envs, sum of mask_widths]
-        :param steps: how many steps each copy's episode has had, int [num_envs]
-        :raises ValueError: if one allows nothing
-        """
-        if not self._masked:
-            return
-        possible = np.logical_or.reduceat(masks, self._mask_starts, axis=1)
-        if not possible.all():
-            copy, i = (int(k) for k in np.argwhere(~possible)[0])
-            raise ValueError(
-                f"The action mask of {self._masked[i]!r} {place(copy, int(steps[copy]))} allows no action: a model must always"
-                " choose one, so allow one that does nothing, also for an agent that is out of play."
-            )
-
-
-def _finite(values: np.ndarray) -> bool:
-    # The fastest way to look at all numbers: zero times any number is zero, but not times nan or an infinity
-    flat = values.reshape(-1)
-    return flat.dot(np.zeros(flat.size, dtype=flat.dtype)) == 0.0
-
-
-def _bounds(space: spaces.Space) -> tuple[Any, Any]:
-    """
-    :param space: an action space
-    :return: what its actions lie between; for boxes a little more, since rescaling rounds
-    """
-    if isinstance(space, spaces.Discrete):
-        return 0, int(space.n) - 1
-    if isinstance(space, spaces.MultiDiscrete):
-        return np.zeros_like(space.nvec), space.nvec - 1
-    if isinstance(space, spaces.Box):
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        slack = np.where(np.isfinite(low) & np.isfinite(high), 1e-4 * (high - low), 0.0)
-        return low - slack, high + slack
-    return 0, 1

@@ -7,18 +7,20 @@ workers cost.
 """
 
 import pickle
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
 from sb3_belief.common.processes import Inbox, leave_interrupts_to_main, start_context
-from sb3_belief.vec_env.joint_env import JointEnv, StepRecord, mask_width
+from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
 
 # What a message with a step's actions begins with; all others are pickles, which do not begin so
 _STEP = b"s"
@@ -52,27 +54,6 @@ def row_type(
             ("action_masks", bool, (sum(map(mask_width, action_spaces.values())),)),
         ]
     )
-
-
-def step_and_reset(
-    env: JointEnv, action: dict[str, Any]
-) -> tuple[dict[str, np.ndarray], float, bool, StepRecord, np.ndarray | None, dict[str, Any]]:
-    """
-    :param env: a copy
-    :param action: by agent
-    :return: observations, reward, whether an episode has ended, what there is to say about the step, the masks for the next
-        actions, and what else the infos hold; the observations and masks are the new episode's where one has ended
-    """
-    obs, reward, terminated, truncated, info = env.step(action)
-    record: StepRecord = info.pop("joint")
-    masks, done = record.action_masks, terminated or truncated
-    if done:
-        info["TimeLimit.truncated"] = truncated and not terminated
-        # The environment may use its arrays again
-        info["terminal_observation"] = {agent: np.array(part) for agent, part in obs.items()}
-        obs, reset_info = env.reset()
-        masks = reset_info.get("action_masks")
-    return obs, reward, done, record, masks, info
 
 
 class WorkersVecEnv(SubprocVecEnv):
@@ -119,6 +100,84 @@ class WorkersVecEnv(SubprocVecEnv):
         self._agents = list(observation_spaces)
         self._row_type = row_type(observation_spaces, action_spaces, scripted_action_spaces)
         self._info_names = _INFOS + ("scripted_actions",) * bool(scripted_action_spaces)
+
+    def step(self, actions: Any) -> VecEnvStepReturn:
+        """
+        Step all copies. Ctrl-C can interrupt the waiting, never a message: an interrupted step is finished before the next
+        one.
+
+        :param actions: For each copy, the actions by agent
+        :return: As :meth:`step_wait`
+        :raises RuntimeError: If a worker died
+        """
+        self.finish_step()
+        with self._reports_deaths("step"):
+            with _uninterrupted():
+                self.step_async(actions)
+            self._await_steps()
+            with _uninterrupted():
+                return self.step_wait()
+
+    def finish_step(self) -> None:
+        """Receive the results of a step that was interrupted, and drop them."""
+        if self.waiting:
+            with self._reports_deaths("step"):
+                self._await_steps()
+                self.step_wait()
+
+    def _await_steps(self) -> None:
+        # The last to start is likely the last to finish: waiting for it first means being woken once
+        for inbox in reversed(self.inboxes):
+            inbox.wait()
+
+    def reset(self) -> Any:
+        self.finish_step()
+        with self._reports_deaths("reset"):
+            return super().reset()
+
+    def close(self) -> None:
+        self.finish_step()
+        super().close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        self.finish_step()
+        return super().get_attr(attr_name, indices)
+
+    def has_attr(self, attr_name: str) -> bool:
+        self.finish_step()
+        return super().has_attr(attr_name)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        self.finish_step()
+        return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    @contextmanager
+    def _reports_deaths(self, doing: str) -> Iterator[None]:
+        """Say which worker died within the block, and end the others."""
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            if self.closed:
+                raise RuntimeError(f"Cannot {doing}: the environment is closed, its worker processes have ended.") from error
+            # A process that has closed its pipe may need a moment to end
+            for process in self.processes:
+                process.join(0.1)
+            dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes) if not p.is_alive()]
+            self._end_all()
+            raise RuntimeError(
+                f"Environment worker process {', '.join(dead) or 'unknown'} died during {doing}(); see its own error above,"
+                " if it could write one. The other workers have been ended: make a new environment to go on."
+            ) from error
+
+    def _end_all(self) -> None:
+        for process in self.processes:
+            process.terminate()
+        for process, remote in zip(self.processes, self.remotes, strict=True):
+            process.join(5.0)
+            remote.close()
+        self.waiting, self.closed = False, True
 
     def step_async(self, actions: Any) -> None:
         """
@@ -225,3 +284,16 @@ def _serve(connection: Connection, parent_end: Connection, env_fn: CloudpickleWr
     env = env_fn.var()
     channel: Any = _Channel(connection, env)
     _worker(channel, parent_end, CloudpickleWrapper(lambda: env))
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of the block, where the system can."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)

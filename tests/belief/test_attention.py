@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch as th
 
-from sb3_belief.belief.attention import attend, topk_indices
+from sb3_belief.belief.attention import attend, reference_attention, topk_indices
 
 
 def plain(queries, keys, values, kept):
@@ -22,7 +22,7 @@ def chosen(n_queries, n_rows, n_selected):
     return th.rand(n_queries, n_rows).topk(n_selected, dim=1).indices.sort(dim=1).values.int()
 
 
-@pytest.mark.parametrize("n_queries, n_rows, n_kept, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2)])
+@pytest.mark.parametrize("n_queries, n_rows, n_selected, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2)])
 def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_selected, width):
     th.manual_seed(0)
     queries, keys = (th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows))
@@ -34,6 +34,21 @@ def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_selected, wid
     found = th.autograd.grad(attend(queries, keys, values, kept)[0], inputs, upstream)
     expected = th.autograd.grad(plain(queries, keys, values, kept), inputs, upstream)
     for ours, theirs in zip(found, expected, strict=True):
+        th.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_queries, n_rows, n_selected, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2), (64, 800, 40, 16)])
+def test_the_fast_path_agrees_with_the_reference(n_queries, n_rows, n_selected, width):
+    th.manual_seed(0)
+    inputs = [th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows, n_rows)]
+    selected, upstream = chosen(n_queries, n_rows, n_selected), th.randn(n_queries, width, dtype=th.float64)
+    means, weights = attend(*inputs, selected)
+    expected_means, expected_weights = reference_attention(*inputs, selected)
+    th.testing.assert_close(expected_means, plain(*inputs, selected), rtol=1e-12, atol=1e-12)
+    th.testing.assert_close(means, expected_means, rtol=1e-12, atol=1e-12)
+    th.testing.assert_close(weights, expected_weights, rtol=1e-12, atol=1e-12)
+    expected = th.autograd.grad(expected_means, inputs, upstream)
+    for ours, theirs in zip(th.autograd.grad(means, inputs, upstream), expected, strict=True):
         th.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
@@ -82,7 +97,7 @@ def test_without_gradients_the_result_is_the_same():
 @pytest.mark.parametrize("kept", [[[0, 3]], [[-1, 0]]])
 def test_rows_that_there_are_not_cannot_be_kept(kept):
     rows = th.randn(3, 2, requires_grad=True)
-    with pytest.raises(ValueError, match=r"rows (0 to 3|-1 to 0) are to be kept of a history of 3"):
+    with pytest.raises(ValueError, match=r"rows (0 to 3|-1 to 0) are selected from a history of 3"):
         attend(th.randn(1, 2), rows, rows, th.tensor(kept, dtype=th.int))
 
 
@@ -110,7 +125,7 @@ def test_the_largest_are_those_of_a_sort(n):
     assert found.equal(values.argsort(dim=1)[:, 8 - n :].sort(dim=1).values.int())
 
 
-@pytest.mark.parametrize("n_kept", [0, 3])
+@pytest.mark.parametrize("n_selected", [0, 3])
 def test_stacked_agents_attend_each_to_its_own_rows(n_selected):
     th.manual_seed(0)
     queries, keys, values = th.randn(2, 5, 4), th.randn(2, 9, 4), th.randn(2, 9, 3)

@@ -2,22 +2,22 @@
 
 import torch as th
 
-from sb3_belief.belief import append_rows, empty_history
+from sb3_belief.belief import append_rows, empty_history, filled_rows
 
 
 def test_history_keeps_the_newest_rows_in_order():
     history = empty_history(5, 1, 1)
-    assert not history.valid.any() and len(history.filled().observations) == 0
+    assert not history.valid.any() and len(filled_rows(history).observations) == 0
     rows = th.arange(8.0).unsqueeze(1)
     first = append_rows(history, rows[:3], -rows[:3])
     assert first.valid.tolist() == [True, True, True, False, False]
-    assert first.filled().observations.flatten().tolist() == [0, 1, 2]
+    assert filled_rows(first).observations.flatten().tolist() == [0, 1, 2]
     second = append_rows(first, rows[3:], -rows[3:])
     assert second.observations.flatten().tolist() == [3, 4, 5, 6, 7] and second.valid.all()
     assert second.actions.flatten().tolist() == [-3, -4, -5, -6, -7]
     third = append_rows(first, rows[3:6], -rows[3:6])
     assert third.observations.flatten().tolist() == [1, 2, 3, 4, 5]
-    assert first.filled().observations.flatten().tolist() == [0, 1, 2]
+    assert filled_rows(first).observations.flatten().tolist() == [0, 1, 2]
 
 
 def test_nothing_new_leaves_the_history_as_it_is():
@@ -29,4 +29,4 @@ def test_nothing_new_leaves_the_history_as_it_is():
 def test_a_history_may_be_filled_several_times_at_once():
     history = append_rows(empty_history(3, 1, 1), th.arange(10.0).unsqueeze(1), th.zeros(10, 1))
     assert history.observations.flatten().tolist() == [7, 8, 9] and history.valid.all()
-    assert history.filled() is history
+    assert filled_rows(history) is history

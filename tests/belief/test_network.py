@@ -17,22 +17,22 @@ def test_rows_can_be_selected_beforehand():
     history = random_history()
     observations = th.randn(5, D_O)
     free = net(observations, history)
-    again = net(observations, history, kept=free.kept, context=net.encode_history(history))
+    again = net(observations, history, selected=free.selected, context=net.encode_history(history))
     th.testing.assert_close(again.latent, free.latent)
-    other = net(observations, history, kept=(free.kept + 1) % 40)
+    other = net(observations, history, selected=(free.selected + 1) % 40)
     assert (other.latent - free.latent).abs().max() > 1e-3
 
 
 def test_more_rows_than_there_are_cannot_be_kept():
     net = DynamicBelief(D_O, W, D, Z)
-    with pytest.raises(ValueError, match="3 rows are to be kept of a history of 2"):
-        net(th.randn(1, D_O), random_history(2), kept=th.zeros(1, 3, dtype=th.long))
+    with pytest.raises(ValueError, match="3 rows are selected from a history of 2"):
+        net(th.randn(1, D_O), random_history(2), selected=th.zeros(1, 3, dtype=th.long))
 
 
 @pytest.mark.parametrize("kept", [None, th.zeros(3, 0, dtype=th.int)])
 def test_while_the_history_is_empty_the_attention_is_not_trained(kept):
     net = DynamicBelief(D_O, W, D, Z)
-    net(th.randn(3, D_O), empty_history(9, D_O, W), kept=kept).prediction.sum().backward()
+    net(th.randn(3, D_O), empty_history(9, D_O, W), selected=kept).prediction.sum().backward()
     without = {name.split(".")[0] for name, parameter in net.named_parameters() if parameter.grad is None}
     assert without == {"action_embedding", "query", "key", "value"}
 
@@ -78,7 +78,7 @@ def test_what_a_variant_does_not_have_does_not_matter(variant):
     if attends:
         with pytest.raises(ValueError, match="empty_history"):
             net(observations)
-        assert net(observations, empty_history(9, D_O, W)).kept.shape == (7, 0)
+        assert net(observations, empty_history(9, D_O, W)).selected.shape == (7, 0)
     else:
         assert th.equal(net(observations).latent, plain)
 
@@ -87,11 +87,11 @@ def test_what_a_variant_does_not_have_does_not_matter(variant):
 def test_no_gradient_flows_through_the_choice_of_rows(similarity):
     net = DynamicBelief(D_O, W, D, Z, 0.1, similarity=similarity)
     observations, history = th.randn(5, D_O), random_history()
-    kept = net(observations, history).kept
+    kept = net(observations, history).selected
     gradients = []
     for given in (None, kept):
         net.zero_grad()
-        net(observations, history, kept=given).latent.sum().backward()
+        net(observations, history, selected=given).latent.sum().backward()
         gradients.append([parameter.grad.clone() for parameter in net.parameters() if parameter.grad is not None])
     for a, b in zip(*gradients, strict=True):
         th.testing.assert_close(a, b)

@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 
+from sb3_belief.belief import BeliefOutput
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
 
@@ -113,3 +114,21 @@ class Trace(BaseCallback):
         assert [name for name, _ in self.entries] == [name for name, _ in other.entries] and len(self.entries) > 50
         pairs = zip(self.entries, other.entries, strict=True)
         return {name for (name, a), (_, b) in pairs if not np.array_equal(a, b, equal_nan=a.dtype.kind == "f")}
+
+
+def record_beliefs(policy: Any) -> list[BeliefOutput]:
+    """
+    Record the beliefs that a policy infers from now on.
+
+    :param policy: A policy with a belief
+    :return: They, in the order of the passes
+    """
+    outputs: list[BeliefOutput] = []
+    infer = policy.features_extractor.infer
+
+    def recording(*args: Any, **kwargs: Any) -> BeliefOutput:
+        outputs.append(infer(*args, **kwargs))
+        return outputs[-1]
+
+    policy.features_extractor.infer = recording
+    return outputs

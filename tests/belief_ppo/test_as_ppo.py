@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.belief_ppo.terminal_values import TerminalValues
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from tests.belief_ppo.helpers import ROLLOUT, SMALL, VARIANTS, make_model
 from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
 
@@ -24,7 +24,7 @@ OUR_ADAM = dict(optimizer_kwargs=dict(eps=1e-5, fused=True))
 @pytest.fixture
 def one_at_a_time(monkeypatch):
     """Bootstrap copy by copy, as SB3 does: in one pass (test_terminal_values.py) the last bits differ."""
-    monkeypatch.setattr(TerminalValues, "compute", lambda *args: None)
+    monkeypatch.setattr(BeliefPolicyMixin, "attach_terminal_values", lambda *args: None)
 
 
 @pytest.mark.parametrize("belief", ["none", "dynamic"])

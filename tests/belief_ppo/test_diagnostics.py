@@ -65,8 +65,8 @@ def test_the_measured_losses_are_those_that_are_trained():
     model.learn(ROLLOUT)
     losses, belief_loss = [], model.policy.belief_loss
 
-    def watched(minibatch):
-        losses.append(belief_loss(minibatch))
+    def watched(belief, minibatch):
+        losses.append(belief_loss(belief, minibatch))
         return losses[-1]
 
     model.policy.belief_loss = watched

@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 import torch as th
 
-from tests.belief_ppo.helpers import EVERY, ROLLOUT, VARIANTS, make_model, observations_of
+from tests.belief_ppo.helpers import EVERY, ROLLOUT, VARIANTS, make_model, observations_of, record_beliefs
 
 
 def test_deterministic_uses_the_mean_and_sampling_draws():
     model = make_model().learn(ROLLOUT)
     obs = np.repeat(model.observation_space.sample()[None], 64, axis=0)
-    tensor = th.as_tensor(obs)
+    tensor, outputs = th.as_tensor(obs), record_beliefs(model.policy)
     model.predict(obs, deterministic=True)
-    output = model.policy.features_extractor.passing.output
+    output = outputs[-1]
     assert th.equal(output.latent, output.mean)
     model.predict(obs, deterministic=False)
-    output = model.policy.features_extractor.passing.output
+    output = outputs[-1]
     assert (output.latent - output.mean).std(dim=0).min() > 0
     values = [model.policy.predict_values(tensor) for _ in range(2)]
-    assert th.equal(*values) and th.equal(model.policy.features_extractor.passing.output.latent, output.mean)
+    assert th.equal(*values) and th.equal(outputs[-1].latent, output.mean)
     # The cached history is the same as the one encoded afresh
     assert th.allclose(values[0], model.policy.predict_values(tensor.clone().requires_grad_()), atol=1e-6)
 
@@ -51,10 +51,10 @@ def test_what_policy_and_value_are_given(belief, policy_latent):
     model = make_model(belief=belief, policy_latent=policy_latent).learn(2 * ROLLOUT)
     tensor, policy = th.as_tensor(observations_of(model, 9)), model.policy
     samples = belief in ("dynamic", "variational")
-    values = []
+    values, outputs = [], record_beliefs(policy)
     for _ in range(2):
         values.append(policy(tensor)[1])
-        output = policy.features_extractor.passing.output
+        output = outputs[-1]
         assert th.equal(output.latent, output.mean) != samples  # the decoder's, whatever the policy is given
         if output.prediction is not None:
             th.testing.assert_close(output.prediction, policy.belief.decoder(output.latent))

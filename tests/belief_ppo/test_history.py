@@ -7,6 +7,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_belief.belief import filled_rows
 from sb3_belief.belief_ppo import BeliefPPO
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, SMALL, VARIANTS, Watch, make_model
 from tests.belief_ppo.toy_envs import AmongOthers
@@ -43,8 +44,8 @@ def test_history_is_the_last_active_steps_of_the_rollout_before(algorithm):
                     expected_obs.append(observations[step, env])
                     expected_actions.append(actions[step, env])
         n_rows = min(40, len(expected_obs))
-        np.testing.assert_array_equal(afterwards.filled().observations.numpy(), np.stack(expected_obs[-n_rows:]))
-        np.testing.assert_array_equal(afterwards.filled().actions.numpy(), np.stack(expected_actions[-n_rows:]))
+        np.testing.assert_array_equal(filled_rows(afterwards).observations.numpy(), np.stack(expected_obs[-n_rows:]))
+        np.testing.assert_array_equal(filled_rows(afterwards).actions.numpy(), np.stack(expected_actions[-n_rows:]))
     assert 0 < active.sum() < active.size and n_rows == 40
 
 
@@ -80,7 +81,7 @@ def test_a_history_longer_than_the_training_is_partly_filled():
     model.learn(ROLLOUT)
     assert model.policy.history.valid.sum() == 2 * ROLLOUT
     # N_h grows with it: a share of the rows there are, not of those there may be
-    assert model.rollout_buffer.belief_minibatch(slice(None)).kept.shape[-1] == round(0.1 * ROLLOUT)
+    assert model.rollout_buffer.belief_minibatch(slice(None)).selected.shape[-1] == round(0.1 * ROLLOUT)
 
 
 def test_with_normalised_observations_the_history_holds_what_the_policy_saw():

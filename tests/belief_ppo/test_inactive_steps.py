@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_belief.belief_ppo import BeliefRolloutBuffer
+from sb3_belief.belief_ppo.buffers import attached
 from tests.belief_ppo.helpers import ALGORITHMS, EVERY, ROLLOUT, SMALL, make_model, same_parameters
 from tests.belief_ppo.toy_envs import AmongOthers
 
@@ -96,25 +97,22 @@ def test_a_minibatch_of_less_than_two_active_rows_goes_with_the_next(n_active, b
 
 def test_the_beliefs_part_goes_with_its_rows():
     model = make_model(env_kwargs=dict(inactive=3), batch_size=3)
-    parts, pairs = [], []
+    pairs = []
 
     def watched_update():
-        buffer, stage = model.rollout_buffer, model.rollout_buffer.on_minibatch
+        buffer = model.rollout_buffer
         flat = {buffer.observations[t, e].tobytes(): buffer.others_actions[t, e] for t in range(14) for e in range(3)}
         get = buffer.get
 
-        def watched_stage(part):
-            parts.append(part)
-            stage(part)
-
         def watched_get(batch_size):
             for samples in get(batch_size):
-                assert len(parts[-1].noise) == len(samples.observations)
-                for row, actions in zip(samples.observations.numpy(), parts[-1].others_actions.numpy(), strict=True):
+                part = attached(samples.observations)
+                assert len(part.noise) == len(samples.observations)
+                for row, actions in zip(samples.observations.numpy(), part.others_actions.numpy(), strict=True):
                     pairs.append((flat[row.tobytes()].tolist(), actions.tolist()))
                 yield samples
 
-        buffer.get, buffer.on_minibatch = watched_get, watched_stage
+        buffer.get = watched_get
         update()
         buffer.get = get
 

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 
 import sb3_belief.belief_ppo.algorithm as algorithm_module
+from sb3_belief.belief import filled_rows
 from sb3_belief.belief_ppo import MaskableBeliefPPO
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Trace, make_model, same_parameters
 
@@ -124,7 +125,7 @@ def test_nothing_of_an_invisible_other_reaches_the_agent():
     hidden = [model.env.envs[0].unwrapped.invisible.random(4).tolist() for model in models]
     assert hidden[0] != hidden[1]
     assert same_parameters(*models)
-    for name in ("others_actions", "others_visible", "noise", "kept", "advantages", "log_probs"):
+    for name in ("others_actions", "others_visible", "noise", "selected", "advantages", "log_probs"):
         first, second = (getattr(model.rollout_buffer, name) for model in models)
         assert np.array_equal(first, second), name
     for a, b in zip(models[0].policy.optimizer.state.values(), models[1].policy.optimizer.state.values(), strict=True):
@@ -142,7 +143,7 @@ def test_the_history_never_holds_a_row_of_the_rollout_trained_on(algorithm, beli
         return {row.tobytes() for row in np.asarray(array, dtype=np.float32).reshape(-1, 5)}
 
     def watched(*args):
-        history, rollout = rows(model.policy.history.filled().observations), rows(model.rollout_buffer.observations)
+        history, rollout = rows(filled_rows(model.policy.history).observations), rows(model.rollout_buffer.observations)
         assert len(rollout) == ROLLOUT and not history & rollout
         checked.append(len(history))
         return step(*args)

@@ -6,7 +6,8 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch.nn import functional as F
 
-from sb3_belief.belief_ppo.others import action_layout, read_others
+from sb3_belief.belief_ppo.buffers import read_others
+from sb3_belief.belief_ppo.others import action_layout
 from tests.belief_ppo.helpers import ROLLOUT, make_model
 
 OTHERS: dict[str, dict[str, spaces.Space]] = {

@@ -7,7 +7,8 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.belief_ppo.terminal_values import TerminalValues
+from sb3_belief.belief_ppo.buffers import attached
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from tests.belief_ppo.helpers import SMALL
 from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
 
@@ -37,9 +38,8 @@ def learned(observation_space, algorithm=BeliefPPO, belief="dynamic"):
 @pytest.mark.parametrize("algorithm, belief", [(BeliefPPO, "dynamic"), (BeliefPPO, "none"), (MaskableBeliefPPO, "static")])
 def test_the_values_are_those_of_one_at_a_time(observation_space, algorithm, belief, monkeypatch):
     model, rewards, passes = learned(observation_space, algorithm, belief)
-    assert not model.policy.terminal_values._waiting
     with monkeypatch.context() as patch:
-        patch.setattr(TerminalValues, "compute", lambda *args: None)
+        patch.setattr(BeliefPolicyMixin, "attach_terminal_values", lambda *args: None)
         expected, one_by_one, passes_one_by_one = learned(observation_space, algorithm, belief)
     np.testing.assert_allclose(rewards, one_by_one, atol=1e-5)
     for name, value in expected.policy.named_parameters():
@@ -48,28 +48,28 @@ def test_the_values_are_those_of_one_at_a_time(observation_space, algorithm, bel
     assert passes_one_by_one - passes == 5 * (N_ENVS - 1)
 
 
-def test_only_the_next_observation_is_answered():
+def test_values_travel_with_their_own_observations():
     model, _, _ = learned(OBSERVATIONS[0])
-    values = model.policy.terminal_values
-    rng = np.random.default_rng(0)
-    rows = rng.uniform(-1, 1, (3, 5)).astype(np.float32)
+    policy = model.policy
+    rows = np.random.default_rng(0).uniform(-1, 1, (3, 5)).astype(np.float32)
+
+    def carried(ended, **changes):
+        infos = [{"terminal_observation": row, "TimeLimit.truncated": True} for row in rows]
+        infos[2].update(changes)
+        policy.attach_terminal_values(infos, np.array(ended))
+        observations = [info["terminal_observation"] for info in infos]
+        assert all(after is None or np.array_equal(after, row) for after, row in zip(observations, rows, strict=True))
+        return [attached(observation) is not None for observation in observations]
+
+    assert carried([True, False, True]) == [True, False, True]
+    assert carried([True, False, False]) == [False, False, False]  # nothing is gained for a single one
+    assert carried([True, True, True], **{"TimeLimit.truncated": False}) == [True, True, False]
+    assert carried([True, True, True], terminal_observation=None) == [True, True, False]
+
     infos = [{"terminal_observation": row, "TimeLimit.truncated": True} for row in rows]
-
-    def compute(ended):
-        values.compute(model.policy, infos, np.array(ended))
-
-    def ask(row):
-        return values.take(th.as_tensor(row[None]))
-
-    compute([True, False, True])
-    value = ask(rows[0])
-    th.testing.assert_close(value, model.policy.predict_values(th.as_tensor(rows[:1])))
-    assert ask(rows[1]) is None and ask(rows[2]) is None  # out of order: all are forgotten
-    compute([True, False, False])
-    assert ask(rows[0]) is None  # one alone is not worth it
-    infos[2]["TimeLimit.truncated"] = False
-    compute([True, True, True])
-    assert ask(rows[0]) is not None and ask(rows[1]) is not None and ask(rows[2]) is None
-    infos[1]["terminal_observation"] = None
-    compute([True, True, True])
-    assert ask(rows[0]) is None
+    policy.attach_terminal_values(infos, np.ones(3, dtype=bool))
+    for i in (2, 0, 1):
+        tensor = policy.obs_to_tensor(infos[i]["terminal_observation"])[0]
+        th.testing.assert_close(policy.predict_values(tensor), policy.predict_values(th.as_tensor(rows[i : i + 1])))
+        # Whatever is computed from the observation is computed anew
+        assert attached(tensor + 0) is None and attached(infos[i]["terminal_observation"] + 0) is None

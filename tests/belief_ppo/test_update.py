@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_belief.belief_ppo.buffers import attach, attached
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
@@ -76,16 +79,21 @@ def test_first_log_ratio_is_zero_for_continuous_actions(belief, sde):
 def test_another_noise_than_the_one_acted_with_is_noticed():
     # What the stored noise is for: drawn anew, the ratio would differ from 1 before any gradient step
     model = make_model(learning_rate=1e-2)
-    stage = model.rollout_buffer.stage
-    model.rollout_buffer.stage = lambda active, minibatch: stage(active, minibatch._replace(noise=-minibatch.noise))
+    add = model.rollout_buffer.add
+
+    def add_other_noise(obs, action, reward, episode_start, values, log_prob):
+        sampled = attached(values)
+        add(obs, action, reward, episode_start, attach(values, sampled._replace(noise=-sampled.noise)), log_prob)
+
+    model.rollout_buffer.add = add_other_noise
     model.learn(2 * ROLLOUT)
     assert model.logger.name_to_value["belief/first_log_ratio"] > 1e-3
 
 
 def test_detached_belief_is_trained_by_its_own_loss_alone():
     detached = make_model(detach_belief=True, action_coef=0.0, kl_coef=0.0)
-    attached = make_model(action_coef=0.0, kl_coef=0.0)
-    for model, moves in ((detached, False), (attached, True)):
+    not_detached = make_model(action_coef=0.0, kl_coef=0.0)
+    for model, moves in ((detached, False), (not_detached, True)):
         before = model.policy.belief.encoder.weight.clone()
         model.learn(3 * ROLLOUT)
         assert th.equal(before, model.policy.belief.encoder.weight) != moves
@@ -94,13 +102,27 @@ def test_detached_belief_is_trained_by_its_own_loss_alone():
 def test_early_stopping_and_clipped_values_are_sb3s():
     model = make_model(target_kl=1e-9, clip_range_vf=0.1, learning_rate=1e-2, n_epochs=20).learn(3 * ROLLOUT)
     assert 3 <= model._n_updates < 10
-    assert model.rollout_buffer.on_minibatch is None and model.policy._minibatch is None
     assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
 
 
-def test_an_error_in_the_update_leaves_no_minibatch_behind():
-    model = make_model()
-    model.policy.optimizer.step = lambda *args: (_ for _ in ()).throw(ArithmeticError("it broke"))
-    with pytest.raises(ArithmeticError, match="it broke"):
-        model.learn(ROLLOUT)
-    assert model.rollout_buffer.on_minibatch is None and model.policy._minibatch is None
+def test_a_callback_that_asks_the_policy_does_not_change_what_is_stored():
+    class Asks(BaseCallback):
+        def _on_step(self):
+            obs = obs_as_tensor(self.locals["new_obs"], self.model.device)
+            with th.no_grad():
+                # All copies, then greedily, then the first copy alone
+                self.model.policy(obs)
+                self.model.policy(obs, deterministic=True)
+                self.model.policy(obs[:1])
+            return True
+
+    model = make_model(learning_rate=1e-2).learn(3 * ROLLOUT, callback=Asks())
+    assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
+
+
+def test_minibatches_serve_the_policy_as_any_observations():
+    model = make_model().learn(2 * ROLLOUT)
+    samples = next(iter(model.rollout_buffer.get(None)))
+    plain = th.as_tensor(samples.observations.numpy().copy())
+    assert attached(samples.observations) is not None and attached(plain) is None
+    assert th.equal(model.policy.predict_values(samples.observations), model.policy.predict_values(plain))

@@ -7,9 +7,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_belief.belief import VARIANTS, DynamicBelief, History, append_rows, empty_history, kl_divergence
+from sb3_belief.belief import VARIANTS, DynamicBelief, History, append_rows, empty_history, filled_rows, kl_divergence
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefMinibatch
-from sb3_belief.belief_ppo.others import read_others
+from sb3_belief.belief_ppo.buffers import attach, read_others
+from sb3_belief.belief_ppo.extractor import BeliefPass
 from tests.equations import reference
 from tests.equations.reference import Belief, Other, Weights
 
@@ -36,7 +37,7 @@ def check_selection(weights: Weights, similarity: str, keep_ratio: float, observ
 
 def expected_beliefs(weights, variant, similarity, keep_ratio, observations, history, noise, kept) -> list[Belief]:
     """The beliefs of a batch, each given the rows that the network kept, which are checked as well."""
-    rows, actions = (part.numpy().astype(np.float64) for part in history.filled()[:2])
+    rows, actions = (part.numpy().astype(np.float64) for part in filled_rows(history)[:2])
     result = []
     for b, observation in enumerate(observations.numpy().astype(np.float64)):
         chosen = kept[b].tolist()
@@ -72,7 +73,7 @@ def test_belief_equals_the_equations(variant, similarity, keep_ratio, n_filled):
         output = net(observations, history, noise)
         assert_equal(
             output,
-            expected_beliefs(weights_of(net), variant, similarity, keep_ratio, observations, history, noise, output.kept),
+            expected_beliefs(weights_of(net), variant, similarity, keep_ratio, observations, history, noise, output.selected),
         )
 
 
@@ -87,10 +88,10 @@ def test_any_choice_among_equally_similar_rows_is_right(similarity):
     asked = th.cat([rows, th.zeros(1, D_O), th.randn(2, D_O)])
     noise = th.randn(6, Z)
     output = net(asked, history, noise)
-    assert output.kept.shape == (6, 7)
-    assert_equal(output, expected_beliefs(weights_of(net), "dynamic", similarity, 0.3, asked, history, noise, output.kept))
+    assert output.selected.shape == (6, 7)
+    assert_equal(output, expected_beliefs(weights_of(net), "dynamic", similarity, 0.3, asked, history, noise, output.selected))
     if similarity == "observation":  # a cosine knows no length: row and double row alike, in whatever order
-        assert all(set(output.kept[i].tolist()) == {i + 3 * k for k in range(7)} for i in range(3))
+        assert all(set(output.selected[i].tolist()) == {i + 3 * k for k in range(7)} for i in range(3))
 
 
 def test_a_log_deviation_out_of_range_is_clamped():
@@ -102,7 +103,7 @@ def test_a_log_deviation_out_of_range_is_clamped():
     output = net(observations, history, noise)
     assert output.log_std[:, 0].unique().tolist() == [-5] and output.log_std[:, 1].unique().tolist() == [2]
     assert_equal(
-        output, expected_beliefs(weights_of(net), "dynamic", "embedding", 0.5, observations, history, noise, output.kept)
+        output, expected_beliefs(weights_of(net), "dynamic", "embedding", 0.5, observations, history, noise, output.selected)
     )
 
 
@@ -130,7 +131,9 @@ def test_the_comparison_notices_another_reading(part, reading, monkeypatch):
     output, weights = net(observations, history, noise), weights_of(net)
     monkeypatch.setattr(reference, part, reading)
     with pytest.raises(AssertionError):
-        assert_equal(output, expected_beliefs(weights, "dynamic", "embedding", 0.2, observations, history, noise, output.kept))
+        assert_equal(
+            output, expected_beliefs(weights, "dynamic", "embedding", 0.2, observations, history, noise, output.selected)
+        )
 
 
 # -- the loss, through the policy --------------------------------------------------------------------------------------
@@ -175,9 +178,10 @@ class Case(NamedTuple):
 
     def run(self) -> th.Tensor | None:
         """The belief's loss as the update computes it."""
-        with self.policy.features_extractor.conditioned(self.minibatch.noise, self.minibatch.kept):  # type: ignore[operator]
-            self.policy.extract_features(self.observations)
-        return self.policy.belief_loss(self.minibatch)
+        belief_pass = BeliefPass(self.minibatch.noise, self.minibatch.selected)
+        self.policy.extract_features(attach(self.observations, belief_pass))
+        assert belief_pass.output is not None
+        return self.policy.belief_loss(belief_pass.output, self.minibatch)
 
 
 def make_case(variant: str, spaces_of: dict[str, spaces.Space], n_filled: int, **kwargs: Any) -> Case:
@@ -211,7 +215,7 @@ def make_case(variant: str, spaces_of: dict[str, spaces.Space], n_filled: int, *
     infos = [{"others_actions": row, "others_visible": seen} for row, seen in zip(flat, visible, strict=True)]
     others_actions, others_visible = (th.as_tensor(part) for part in read_others(infos, policy.layout))
     with th.no_grad():
-        kept = policy.belief(observations, policy.history).kept  # type: ignore[misc]
+        kept = policy.belief(observations, policy.history).selected  # type: ignore[misc]
     noise = th.randn(5, Z if variant in reference.SAMPLING else 0)
     return Case(policy, others, observations, BeliefMinibatch(noise, kept, others_actions, others_visible), actions)
 
@@ -221,12 +225,12 @@ def expected_loss(case: Case, weights: Weights, variant: str, alpha: float, beta
     rows, actions = (
         (np.zeros((0, D_O)), np.zeros((0, 1)))
         if history is None
-        else (part.numpy().astype(np.float64) for part in history.filled()[:2])
+        else (part.numpy().astype(np.float64) for part in filled_rows(history)[:2])
     )
     part = case.minibatch
     beliefs = [
         reference.belief(weights, variant, observation.numpy(), rows, actions, noise.numpy(), kept.tolist())
-        for observation, noise, kept in zip(case.observations, part.noise, part.kept, strict=True)
+        for observation, noise, kept in zip(case.observations, part.noise, part.selected, strict=True)
     ]
     visible = part.others_visible.numpy()
     return reference.belief_loss(beliefs, variant, alpha, beta, loss, case.actions, visible, case.others)

@@ -7,7 +7,7 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_belief.belief_ppo import MaskableBeliefPPO
-from sb3_belief.belief_ppo.loss_injection import add_loss
+from sb3_belief.belief_ppo.policies import add_loss
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model
 
 ALPHA, BETA = 0.5, 0.05
@@ -86,7 +86,7 @@ def test_gradient_equals_that_of_the_explicit_sum(algorithm, switches):
         part = model.rollout_buffer.belief_minibatch(slice(None))
         part = type(part)(*(field.reshape(ROLLOUT, -1) for field in part))
         observations = th.as_tensor(model.rollout_buffer.observations.reshape(ROLLOUT, -1))
-        output = model.policy.belief(observations, model.policy.history, part.noise, part.kept)
+        output = model.policy.belief(observations, model.policy.history, part.noise, part.selected)
         ppo, further = ppo_loss(model, output), belief_loss(model, output, part)
         for gradients, loss in ((without_belief, ppo), (explicit, ppo + further)):
             named = dict(model.policy.named_parameters())

@@ -7,6 +7,7 @@ import pytest
 import torch as th
 
 from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.belief import filled_rows
 
 SMALL: dict[str, Any] = dict(n_steps=20, batch_size=80, n_epochs=2, history_length=60, keep_ratio=0.1)
 
@@ -36,7 +37,7 @@ def test_every_agent_learns_a_belief_of_its_own():
         np.testing.assert_array_equal(blocks.sum(axis=2), buffer.others_visible.astype(np.float32))
         assert not buffer.others_visible[~buffer.active].any()
         # Slot occupancy is the first component of the observation: the history has no step without a car
-        history = model.policy.history.filled()
+        history = filled_rows(model.policy.history)
         assert len(history.valid) > 0 and (history.observations[:, 0] == 1).all()
     first, second = (team.agents[agent].policy.belief.query.weight for agent in ("car_0", "car_1"))
     assert not th.equal(first, second)

@@ -18,6 +18,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_belief import BeliefPPO
+from sb3_belief.belief import filled_rows
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ToyEnv
 
@@ -105,7 +106,7 @@ def test_an_agents_statistics_load_alone(tmp_path):
     assert alone.predict(normalized, deterministic=True)[0].tolist() == expected["agent_0"].tolist()
     # The history holds observations as the agent saw them
     assert alone.policy.history is not None
-    rows = alone.policy.history.filled().observations
+    rows = filled_rows(alone.policy.history).observations
     assert len(rows) == 40 and rows.abs().max() <= statistics.clip_obs and rows.std(dim=0).mean() > 0.3
 
 

@@ -19,7 +19,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
 from sb3_belief.belief import BeliefOutput, HistoryContext
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, flat_observations
+from sb3_belief.belief_ppo.buffers import attached
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass, flat_observations
 from sb3_belief.common.tensor_version import TensorVersions
 from sb3_belief.team.batched_forward.signature import signature
 from sb3_belief.team.lockstep.scheduler import BATCHES_FORWARD, Scheduler
@@ -249,14 +250,23 @@ class ForwardRequest:
         """
         assert self.latents is not None
         latents, attributes = self.latents, vars(self.policy)
-        if self._extractor is not None:
-            self._extractor.passing.output, self._extractor.passing.noise = latents.belief, self._noise
+
+        def extract_features(obs: Any) -> tuple[th.Tensor, th.Tensor]:
+            if latents.belief is not None:
+                belief_pass: BeliefPass = attached(obs)
+                belief_pass.output, belief_pass.noise = latents.belief, self._noise
+            return latents.policy, latents.value
+
         # SB3's forward() calls these two, one after the other, and nothing else before the distribution
-        attributes["extract_features"] = attributes["mlp_extractor"] = lambda _: (latents.policy, latents.value)
+        attributes["extract_features"], attributes["mlp_extractor"] = extract_features, _identity
         try:
             return type(self.policy).forward(self.policy, *args, **kwargs)
         finally:
             del attributes["extract_features"], attributes["mlp_extractor"]
+
+
+def _identity(features: Any) -> Any:
+    return features
 
 
 def _of_agent(i: int, policy: th.Tensor, value: th.Tensor, belief: BeliefOutput | None) -> Latents:
@@ -268,7 +278,7 @@ def _equal(a: Latents, b: Latents) -> bool:
     if a.policy.device.type != "cpu":
         # No device but the CPU promises equal bits
         return th.allclose(a.policy, b.policy, atol=1e-5) and th.allclose(a.value, b.value, atol=1e-5)
-    same_rows = a.belief is None or b.belief is None or th.equal(a.belief.kept, b.belief.kept)
+    same_rows = a.belief is None or b.belief is None or th.equal(a.belief.selected, b.belief.selected)
     return same_rows and th.equal(a.policy, b.policy) and th.equal(a.value, b.value)
 
 
