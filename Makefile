@@ -7,7 +7,7 @@ SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
 PEERS_VENV := .venv-peers
 PEERS_STAMPS := $(patsubst %,$(PEERS_VENV)/%/.installed,rllib agilerl benchmarl)
-SOURCES := sb3_belief tests benchmarks train.py
+SOURCES := sb3_belief tests benchmarks studies train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 # As many tests at once as there are cores; PYTEST_JOBS=0 for one after the other
@@ -58,7 +58,7 @@ $(PEERS_VENV)/%/.installed: benchmarks/peers/%.txt
 	$(PEERS_VENV)/$*/bin/python -m pip install -r $< >$(PEERS_VENV)/$*.log 2>&1
 	@touch $@
 
-bench-peers: $(STAMP)  ## measure other libraries beside ours (an environment for each: 5 GB), into benchmarks/out/peers.json
+bench-peers: $(STAMP)  ## compare with other libraries (an environment for each: 5 GB), into benchmarks/out/peers.json
 	-$(MAKE) --keep-going --no-print-directory $(PEERS_STAMPS)
 	$(BIN)/python -m benchmarks.peers $(BENCH_ARGS)
 

@@ -1,10 +1,10 @@
 """
-Three stock PPOs that learn on mpe2's simple_spread by a program of their own: what a team is compared with.
+Three stock PPOs that learn on mpe2's simple_spread in a hand-written program: what a team is compared with.
 
 - ``ByHand`` is what one would write for this environment only: it steps copies of mpe2's own parallel environment (all agents
-  always in play, one action type, every end a time limit, no visibility, no infos)
-- ``ByHandOnTeamEnv`` steps the same vectorised environment as the team: the difference is what lockstep and SB3's own rollout
-  cost
+  always in play, one kind of action, every end a time limit, no visibility, no infos)
+- ``ByHandOnTeamEnv`` steps the same vectorised environment as the team, so that the difference to the team is the cost of
+  lockstep and of SB3's own rollout
 """
 
 from collections import deque
@@ -17,38 +17,33 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 
 from benchmarks.teams import SPREAD
-from sb3_belief.team import make_team_env
-from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief import Team, make_team_env
 
 Advance = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, dict[int, dict[str, np.ndarray]]]
 
 
 class ByHandOnTeamEnv:
     """
-    The policies, buffers and ``train()`` of three stock PPOs, with the loop over steps written out.
+    Loop over steps, written out, around the policies, buffers and ``train()`` of three stock PPOs.
 
-    :param n_envs: number of copies
-    :param settings: arguments of PPO
+    :param n_envs: Number of copies
+    :param settings: Arguments of PPO
     """
 
     def __init__(self, n_envs: int, settings: dict[str, Any]) -> None:
         self.n_envs = n_envs
         self.env = make_team_env(SPREAD, n_envs=n_envs, seed=0)
         self.agents = self.env.possible_agents
-        # Only for the models' spaces; it is never stepped
-        scheduler = JointLoop(make_team_env(SPREAD, n_envs=n_envs))
-        self.models: dict[str, PPO] = {}
-        for k, agent in enumerate(self.agents):
-            model = PPO("MlpPolicy", scheduler.agent_envs[agent], seed=k, device="cpu", **settings)
+        # A convenient way to make the models; this team never learns, nor is its environment stepped
+        team = Team(PPO, "MlpPolicy", make_team_env(SPREAD, n_envs=n_envs), seed=0, device="cpu", **settings)
+        self.models: dict[str, PPO] = team.agents  # type: ignore[assignment]
+        for model in self.models.values():
             model.set_logger(Logger(None, []))
-            self.models[agent] = model
         self.obs = self._reset()
         self.starts = np.ones(self.n_envs, dtype=bool)
 
-    def iterate(self) -> int:
-        """
-        :return: joint steps of one rollout and the update after it
-        """
+    def __call__(self) -> int:
+        """Collect one rollout, update all models, and return the number of joint steps."""
         n_steps = next(iter(self.models.values())).n_steps
         for model in self.models.values():
             model.policy.set_training_mode(False)
@@ -86,16 +81,14 @@ class ByHandOnTeamEnv:
         return self.env.reset()
 
     def _advance(self, actions: dict[str, np.ndarray]) -> Advance:
-        """
-        :return: next observations, rewards [n_envs, n], dones [n_envs] and of ended copies the last observations
-        """
+        """Return next observations, rewards [n_envs, n], dones [n_envs], and the last observations of copies that ended."""
         obs, _, dones, infos = self.env.step(actions)
         rewards = np.array([info["agent_rewards"] for info in infos])
         return obs, rewards, dones, {i: infos[i]["terminal_observation"] for i in np.flatnonzero(dones).tolist()}
 
 
 class ByHand(ByHandOnTeamEnv):
-    """The same loop over environments of mpe2 as they are."""
+    """The same loop over mpe2's environments as they are."""
 
     def _reset(self) -> dict[str, np.ndarray]:
         self.envs = [simple_spread_v3.parallel_env() for _ in range(self.n_envs)]

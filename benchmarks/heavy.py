@@ -1,15 +1,14 @@
 """
 Do workers pay for an environment whose step is heavy? Eight copies in workers, each step of which takes 10 ms.
 
-``burns``: 10 ms of CPU time (a simulator); ideal are as many copies at once as there are cores, so cores / 10 ms steps per
-wall second. ``sleeps``: 10 ms of waiting (a server); ideal are all copies at once, so 8 / 10 ms. ``workers_vs_ideal`` is what
-stepping with random actions reaches of that, the lower of the two. A team that learns in them acts and trains between the
-steps, which the ideal does not count; it is shown beside. So is the control: processes that do nothing but burn or sleep when
-told, which is the most that could be reached.
+With ``burns`` a step is 10 ms of CPU time (a simulator). Ideally as many copies run at once as there are cores, which is
+cores / 10 ms steps per second of wall-clock time. With ``sleeps`` a step is 10 ms of waiting (a server). Ideally all copies
+wait at once, which is 8 / 10 ms. ``workers_vs_ideal`` is the share of this ideal that stepping with random actions reaches,
+the lower of the two. Shown beside it are a team that learns in these environments (``learning``), which also acts and trains
+between the steps, and a control (``bare``): processes that only burn or sleep on request, which is the most that is possible.
 """
 
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,24 +17,21 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3 import PPO
 
+from benchmarks.loop_process import LoopProcess
 from benchmarks.measure import Loop, Spread, cores, speeds, spread
 from benchmarks.report import Report
 from benchmarks.teams import TeamLoop
-from benchmarks.told import Told
-from sb3_belief import Team, make_team_env
-from sb3_belief.team import TeamVecEnv
+from sb3_belief import Team, TeamVecEnv, make_team_env
 
 SECONDS, COPIES, EPISODE = 0.01, 8, 25
 
 
 def pass_time(kind: str) -> None:
-    """
-    :param kind: ``"burns"`` CPU time or ``"sleeps"``
-    """
+    """Let the time of one step pass, which ``"burns"`` CPU time or ``"sleeps"``."""
     if kind == "sleeps":
         time.sleep(SECONDS)
         return
-    # Its own CPU time: by the clock on the wall, workers that share a core would all be done at once
+    # The thread's own CPU time: by the wall clock, workers that share a core would all be done at once
     end = time.thread_time() + SECONDS
     while time.thread_time() < end:
         pass
@@ -43,12 +39,12 @@ def pass_time(kind: str) -> None:
 
 class HeavyEnv(ParallelEnv):
     """
-    Two agents, whose every step takes its time.
+    Environment of two agents whose steps take time and have no content.
 
-    :param kind: ``"burns"`` CPU time or ``"sleeps"``
+    :param kind: ``"burns"`` or ``"sleeps"``
     """
 
-    metadata: dict[str, Any] = {"name": "heavy_v0"}  # noqa: RUF012 (PettingZoo's own kind of attribute)
+    metadata: dict[str, Any] = {"name": "heavy_v0"}  # noqa: RUF012 (PettingZoo declares it so)
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -71,8 +67,7 @@ class HeavyEnv(ParallelEnv):
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         pass_time(self.kind)
         self._time += 1
-        over = self._time == EPISODE
-        acted = self.agents
+        acted, over = self.agents, self._time == EPISODE
         if over:
             self.agents = []
         flags = dict.fromkeys(acted, False), dict.fromkeys(acted, over)
@@ -82,41 +77,25 @@ class HeavyEnv(ParallelEnv):
         return {agent: np.zeros(8, dtype=np.float32) for agent in self.possible_agents}
 
 
-class _Steps:
-    """Random actions, drawn beforehand."""
+def _stepper(env: TeamVecEnv, n_steps: int) -> Loop:
+    draws = np.random.default_rng(0).integers(0, 3, size=(n_steps, len(env.possible_agents), env.num_envs))
+    actions = [dict(zip(env.possible_agents, draw, strict=True)) for draw in draws]
+    env.reset()
 
-    def __init__(self, env: TeamVecEnv, n_steps: int) -> None:
-        draws = np.random.default_rng(0).integers(0, 3, size=(n_steps, len(env.possible_agents), env.num_envs))
-        self.env, self.actions = env, [dict(zip(env.possible_agents, draw, strict=True)) for draw in draws]
-        env.reset()
+    def loop() -> int:
+        for joint in actions:
+            env.step(joint)
+        return n_steps * env.num_envs
 
-    def __call__(self) -> int:
-        for actions in self.actions:
-            self.env.step(actions)
-        return len(self.actions) * self.env.num_envs
-
-
-class _Bare:
-    """Processes that only let the time pass: the control."""
-
-    def __init__(self, kind: str, copies: int, n_steps: int) -> None:
-        self._copies, self._n_steps = [Told(_step_bare, kind) for _ in range(copies)], n_steps
-
-    def __call__(self) -> int:
-        steps = 0
-        for _ in range(self._n_steps):
-            for copy in self._copies:
-                copy.tell()
-            steps += sum(copy.steps() for copy in self._copies)
-        return steps
-
-    def close(self) -> None:
-        """End the processes."""
-        for copy in self._copies:
-            copy.end()
+    return loop
 
 
-def _step_bare(kind: str) -> Loop:
+def _learner(env: TeamVecEnv, n_steps: int) -> Loop:
+    settings: dict[str, Any] = dict(n_steps=n_steps, batch_size=n_steps * env.num_envs // 2, n_epochs=4, device="cpu")
+    return TeamLoop(Team(PPO, "MlpPolicy", env, seed=0, **settings))
+
+
+def _make_bare(kind: str) -> Loop:
     def step() -> int:
         pass_time(kind)
         return 1
@@ -124,33 +103,40 @@ def _step_bare(kind: str) -> Loop:
     return step
 
 
-def _learner(env: TeamVecEnv, n_steps: int) -> TeamLoop:
-    settings: dict[str, Any] = dict(n_steps=n_steps, batch_size=n_steps * env.num_envs // 2, n_epochs=4, device="cpu")
-    return TeamLoop(Team(PPO, "MlpPolicy", env, seed=0, **settings))
+def _bare(processes: list[LoopProcess], n_steps: int) -> Loop:
+    def loop() -> int:
+        steps = 0
+        for _ in range(n_steps):
+            for process in processes:
+                process.start()
+            steps += sum(process.steps() for process in processes)
+        return steps
+
+    return loop
 
 
 def run(report: Report) -> None:
-    """
-    :param report: what is found goes there
-    """
+    """Measure part ``workers``."""
     copies, n_steps = (2, 4) if report.quick else (COPIES, 32)
     report.title("workers", f"{copies} copies in workers, each step of a copy takes {1000 * SECONDS:g} ms, {cores()} cores")
-    ideal = {"burns": min(cores(), copies) / SECONDS, "sleeps": copies / SECONDS}
-    makers: dict[str, Callable[[TeamVecEnv, int], _Steps | TeamLoop]] = {"stepped": _Steps, "learning": _learner}
     shares: dict[str, Spread] = {}
-    for kind, best in ideal.items():
-        envs = [make_team_env(partial(HeavyEnv, kind), n_envs=copies, vec_env="subproc") for _ in makers]
-        bare = _Bare(kind, copies, n_steps)
-        loops: dict[str, Loop] = {
-            f"{kind}, {name}": make(env, n_steps) for (name, make), env in zip(makers.items(), envs, strict=True)
+    for kind, ideal in {"burns": min(cores(), copies) / SECONDS, "sleeps": copies / SECONDS}.items():
+        envs = [make_team_env(partial(HeavyEnv, kind), n_envs=copies, vec_env="subproc") for _ in range(2)]
+        processes = [LoopProcess(_make_bare, kind) for _ in range(copies)]
+        loops = {
+            "stepped": _stepper(envs[0], n_steps),
+            "learning": _learner(envs[1], n_steps),
+            "bare": _bare(processes, n_steps),
         }
-        samples = report.measure("workers", {**loops, f"{kind}, bare": bare})
-        bare.close()
+        samples = report.measure("workers", {f"{kind}, {name}": loop for name, loop in loops.items()})
         for env in envs:
             env.close()
-        shares.update({name: spread([v / best for v in speeds(samples[name], "wall")]) for name in samples})
-    for name, share in shares.items():
-        key = "workers_" + name.replace(", ", "_")
-        report.add_ratio(key, share, f"steps per wall second / {ideal[name.split(',')[0]]:,.0f}, the ideal ({name})")
-    worst = min((share for name, share in shares.items() if name.endswith("stepped")), key=lambda share: share.median)
+        for process in processes:
+            process.close()
+        for name in loops:
+            share = shares[f"{kind}_{name}"] = spread([v / ideal for v in speeds(samples[f"{kind}, {name}"], "wall")])
+            report.add_ratio(
+                f"workers_{kind}_{name}", share, f"steps per wall second / {ideal:,.0f}, the ideal ({kind}, {name})"
+            )
+    worst = min(shares["burns_stepped"], shares["sleeps_stepped"], key=lambda share: share.median)
     report.add_ratio("workers_vs_ideal", worst, "the lower of those stepped with random actions")

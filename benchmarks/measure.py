@@ -1,4 +1,4 @@
-"""Measure several loops in turn within one run: what the machine does besides is then unfair to none of them."""
+"""Measure loops in turns within one run, so that whatever else the machine does affects all of them alike."""
 
 import multiprocessing
 import os
@@ -16,9 +16,9 @@ class Sample(NamedTuple):
     """
     One measurement.
 
-    :param steps: how many were done
-    :param cpu: seconds of CPU time that they took, of this process and its workers
-    :param wall: seconds that passed
+    :param steps: Number of steps that were done
+    :param cpu: CPU seconds that they took, of this process and its workers
+    :param wall: Wall-clock seconds that passed
     """
 
     steps: int
@@ -28,9 +28,11 @@ class Sample(NamedTuple):
 
 class Spread(NamedTuple):
     """
-    :param median: half of the values are below
-    :param low: a quarter of them are below
-    :param high: a quarter of them are above
+    Median and quartiles of several values.
+
+    :param median: Half of the values are below it
+    :param low: A quarter of the values are below it
+    :param high: A quarter of the values are above it
     """
 
     median: float
@@ -39,16 +41,12 @@ class Spread(NamedTuple):
 
 
 def cores() -> int:
-    """
-    :return: how many this process may use
-    """
+    """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cpu_seconds() -> float:
-    """
-    :return: CPU time of this process so far, of the children that it has waited for, and (on Linux) of the workers that live
-    """
+    """Return the CPU time so far of this process, of its children that have ended and (on Linux) of its live workers."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system + _workers_cpu_seconds()
 
@@ -56,20 +54,17 @@ def cpu_seconds() -> float:
 def _workers_cpu_seconds() -> float:
     seconds = 0.0
     for process in multiprocessing.active_children():
-        # A process is counted among the children that were waited for only when it has ended
+        # The system adds a child's time to that of its parent only when the child has ended
         stat = Path(f"/proc/{process.pid}/stat")
         if stat.exists():
-            # Behind the name, which may hold blanks: user and system time are the 14th and 15th field of all
+            # After the name, which may contain spaces: user and system time are fields 14 and 15 of the line
             user, system = stat.read_text().rpartition(")")[2].split()[11:13]
             seconds += (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
     return seconds
 
 
 def take(loop: Loop) -> Sample:
-    """
-    :param loop: what to measure
-    :return: one measurement of it
-    """
+    """Call the loop once and return its measurement."""
     cpu, wall = cpu_seconds(), time.perf_counter()
     steps = loop()
     passed = time.perf_counter() - wall
@@ -78,27 +73,26 @@ def take(loop: Loop) -> Sample:
 
 def alternate(loops: Mapping[str, Loop], rounds: int, warmup: int = 1) -> dict[str, list[Sample]]:
     """
-    :param loops: what to compare, by name
-    :param rounds: measurements of each
-    :param warmup: runs of each beforehand that do not count
-    :return: the measurements of each, round by round
+    Measure the loops in turns.
+
+    :param loops: The loops to compare, by name
+    :param rounds: Number of measurements of each loop
+    :param warmup: Number of calls of each loop beforehand that are not measured
+    :return: The measurements of each loop, one per round
     """
     for loop in loops.values():
         for _ in range(warmup):
             loop()
     samples: dict[str, list[Sample]] = {name: [] for name in loops}
     for i in range(rounds):
-        # Back and forth, so that nobody always comes after the one that spoils the caches
+        # Back and forth, so that no loop always runs after the one that leaves the caches in the worst state
         for name in list(loops)[:: 1 if i % 2 == 0 else -1]:
             samples[name].append(take(loops[name]))
     return samples
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """
-    :param values: at least one
-    :return: their median and quartiles
-    """
+    """Return median and quartiles of at least one value."""
     if len(values) < 2:
         return Spread(values[0], values[0], values[0])
     low, median, high = statistics.quantiles(values, n=4, method="inclusive")
@@ -106,21 +100,18 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def speeds(samples: Sequence[Sample], clock: str = "cpu") -> list[float]:
-    """
-    :param samples: measurements of one loop
-    :param clock: ``"cpu"`` or ``"wall"``
-    :return: steps per second of each
-    """
-    # A worker's clock is coarse, and the shortest measurements may take no tick of it
+    """Return the steps per second of each sample, by the clock ``"cpu"`` or ``"wall"``."""
+    # A worker's CPU clock is coarse: the shortest measurements may not take a single tick of it
     return [sample.steps / max(getattr(sample, clock), 1e-9) for sample in samples]
 
 
 def ratio(of: Sequence[Sample], to: Sequence[Sample], clock: str = "cpu") -> Spread:
     """
-    :param of: measurements of one loop
-    :param to: of another, in the same rounds
+    Compare the speeds of two loops round by round, since the machine changes more slowly than the loops take turns.
+
+    :param of: Measurements of one loop
+    :param to: Measurements of another loop, from the same rounds
     :param clock: ``"cpu"`` or ``"wall"``
-    :return: the speed of the one over that of the other; round by round, since the machine changes more slowly than the loops
-        take turns
+    :return: Speed of the first loop divided by that of the second
     """
     return spread([a / b for a, b in zip(speeds(of, clock), speeds(to, clock), strict=True)])

@@ -1,4 +1,4 @@
-"""What the benchmarks found: printed as it comes, and written as JSON at the end."""
+"""The report of a benchmark: printed as results come in, and written as JSON at the end."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from benchmarks.measure import Loop, Sample, Spread, alternate, cores, speeds, spread
 from sb3_belief.common import versions as package
 
-#: What each ratio should be: at least (or at most, or less than) the number
+#: The aim of each ratio: at least, or at most, this number
 BARS: dict[str, tuple[str, float]] = {
     "lockstep_vs_hand": (">=", 0.97),
     "ippo_vs_hand": (">=", 1.25),
@@ -25,7 +25,7 @@ BARS: dict[str, tuple[str, float]] = {
     "two_cores_vs_one": (">=", 1.5),
     "workers_vs_ideal": (">=", 0.85),
 }
-#: MiB
+#: The same of peak memory, in MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}
 _HOLDS = {">=": float.__ge__, "<=": float.__le__, "<": float.__lt__}
 
@@ -40,11 +40,13 @@ def _judge(value: float, bar: tuple[str, float] | None) -> str:
 @dataclass
 class Report:
     """
-    :param rounds: measurements of each loop
-    :param quick: whether all was made tiny: then the numbers mean nothing
+    Report of what was measured.
+
+    :param rounds: Number of measurements of each loop
+    :param quick: Whether everything is tiny. Then the numbers mean nothing
     """
 
-    #: By key of a ratio, see ``BARS``
+    #: Aims by key of a ratio, see ``BARS``
     bars: ClassVar[Mapping[str, tuple[str, float]]] = BARS
 
     rounds: int
@@ -52,26 +54,25 @@ class Report:
     rows: list[dict[str, Any]] = field(default_factory=list)
     ratios: dict[str, float | None] = field(default_factory=lambda: dict.fromkeys(BARS))
     ratio_rows: dict[str, dict[str, Any]] = field(default_factory=dict)
-    peak_mib: dict[str, float | None] = field(default_factory=dict)
+    peak_mib: dict[str, float] = field(default_factory=dict)
     time: dict[str, Any] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
 
     def title(self, part: str, text: str) -> None:
-        """
-        :param part: its name
-        :param text: what it measures
-        """
+        """Print the heading of a part: its name, and what it measures."""
         print(f"\n{part}: {text}", flush=True)
 
     def measure(
         self, part: str, loops: Mapping[str, Loop], unit: str = "joint steps", warmup: int = 1
     ) -> dict[str, list[Sample]]:
         """
-        :param part: of the benchmark
-        :param loops: what to compare, by name
-        :param unit: what steps they count
-        :param warmup: runs of each beforehand that do not count
-        :return: the measurements of each, round by round
+        Measure loops in turns and add their speeds.
+
+        :param part: Part of the benchmark
+        :param loops: The loops to compare, by name
+        :param unit: Kind of steps that they count
+        :param warmup: Number of calls of each loop beforehand that are not measured; none in a quick run
+        :return: The measurements of each loop, one per round
         """
         samples = alternate(loops, self.rounds, 0 if self.quick else warmup)
         self.add_samples(part, samples, unit)
@@ -79,9 +80,11 @@ class Report:
 
     def add_samples(self, part: str, samples: Mapping[str, Sequence[Sample]], unit: str) -> None:
         """
-        :param part: of the benchmark
-        :param samples: measurements, by name
-        :param unit: what steps they count
+        Add speeds.
+
+        :param part: Part of the benchmark
+        :param samples: Measurements, by name
+        :param unit: Kind of steps that they count
         """
         width = max(map(len, samples))
         print(f"  {'':{width}s} {unit + ' per CPU second':>30s} {'per wall second':>30s}   (quartiles)")
@@ -97,9 +100,11 @@ class Report:
 
     def add_ratio(self, key: str, found: Spread, text: str) -> None:
         """
-        :param key: of ``bars``, or another: then it has no bar and is a detail
-        :param found: the ratio and its spread
-        :param text: what is divided by what
+        Add a ratio, and judge it where it has a bar.
+
+        :param key: Key of ``bars``, or another one for a detail without a bar
+        :param found: The ratio and its quartiles
+        :param text: What is divided by what
         """
         bar = self.bars.get(key)
         if bar is not None:
@@ -109,27 +114,36 @@ class Report:
             f"  {key}: {text}: {found.median:.3f} ({found.low:.3f} to {found.high:.3f}){_judge(found.median, bar)}", flush=True
         )
 
-    def add_peak(self, name: str, mib: float | None) -> None:
+    def add_phases(self, part: str, milliseconds: Mapping[str, Mapping[str, float]]) -> None:
         """
-        :param name: of the program whose memory it is
-        :param mib: its peak; None where the system does not tell
+        Add where the time goes, as ``time[part]``.
+
+        :param part: Part of the benchmark
+        :param milliseconds: CPU milliseconds per joint step of each phase and of all together (``"total"``), by algorithm
         """
+        updates = {algo: phases["update"] for algo, phases in milliseconds.items()}
+        # The belief's backward pass is one with that of the policy: its share is what an update takes longer than without it
+        share = 1 - updates["ippo"] / updates["belief_ppo"]
+        self.time[part] = {"ms_per_joint_step": milliseconds, "belief_share_of_update": share}
+        print("  where the time goes, CPU ms per joint step (share):")
+        print("  " + " " * 12 + "".join(f"{algo:>18s}" for algo in milliseconds))
+        for phase in milliseconds["ippo"]:
+            cells = [f"{phases[phase]:.3f} ({phases[phase] / phases['total']:4.0%})" for phases in milliseconds.values()]
+            print(f"  {phase:12s}" + "".join(f"{cell:>18s}" for cell in cells))
+        print(f"  the belief's share of the update: {share:.0%} (what it takes longer than that of ippo)", flush=True)
+
+    def add_peak(self, name: str, mib: float) -> None:
+        """Add the peak memory of a program, in MiB."""
         self.peak_mib[name] = mib
-        text = "unknown" if mib is None else f"{mib:,.0f} MiB{_judge(mib, PEAK_BARS.get(name))}"
-        print(f"  {name}: {text}", flush=True)
+        print(f"  {name}: {mib:,.0f} MiB{_judge(mib, PEAK_BARS.get(name))}", flush=True)
 
     def skip(self, name: str, reason: str) -> None:
-        """
-        :param name: of what is not measured
-        :param reason: why
-        """
+        """Note that something is not measured, and why."""
         self.skipped[name] = reason
         print(f"  {name}: skipped: {reason}", flush=True)
 
     def write(self, path: Path) -> None:
-        """
-        :param path: of the JSON file
-        """
+        """Write everything to a JSON file."""
         details = {
             "rounds": self.rounds,
             "quick": self.quick,
@@ -143,24 +157,19 @@ class Report:
 
 
 def write_json(content: Mapping[str, Any], path: Path) -> None:
-    """
-    :param content: of the file
-    :param path: of the file, whose folder is made if it is missing
-    """
+    """Write a JSON file, and make its folder if that is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=2) + "\n")
     print(f"\nwritten: {path}")
 
 
 def versions() -> dict[str, Any]:
-    """
-    :return: what was measured with, and on
-    """
+    """Return the versions of the packages that were measured, and what the machine is."""
     found: dict[str, Any] = {**package.versions(), "system": platform.platform(), "cores": cores()}
     found["processor"] = _processor()
-    # What else ran: on a busy machine only the ratios mean something
+    # On a machine that is busy with other work only the ratios mean something
     found["load"] = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
-    # Not where SMAX is measured
+    # SMAX is measured in an environment without mpe2
     found["mpe2"] = metadata.version("mpe2") if find_spec("mpe2") else None
     return found
 

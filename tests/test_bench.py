@@ -1,14 +1,17 @@
-"""The benchmarks run and count right; how fast anything is, is never asserted."""
+"""The benchmarks run and count right. How fast anything is, is never asserted."""
 
 import json
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
 
-from benchmarks import bench, gpu, heavy, stacked
-from benchmarks.measure import Sample, alternate, cores, ratio, spread
+from benchmarks import acting, attention, batched_envs, bench, gpu, heavy
+from benchmarks.measure import Sample, alternate, cores, ratio, spread, take
 from benchmarks.report import BARS, Report
+from benchmarks.teams import PHASES, TeamLoop, junction_team, milliseconds, spread_team, time_of
 
 AGENT_STEPS = 32
 
@@ -29,11 +32,12 @@ def test_the_file_says_all_that_others_read(written):
     assert written["versions"]["torch"]
     assert written["details"]["quick"] is True
     for part in ("a", "b"):
-        time = written["details"]["time"][part]
-        assert time["belief_share_of_update"] < 1
-        for parts in time["ms_per_joint_step"].values():
-            assert {"environment", "transfer", "policy", "buffer", "update: backward", "rest"} <= parts.keys()
+        found = written["details"]["time"][part]
+        assert found["belief_share_of_update"] < 1
+        for parts in found["ms_per_joint_step"].values():
             total = parts.pop("total")
+            assert parts.keys() == set(PHASES)
+            assert all(value > 0 for value in parts.values())
             assert sum(parts.values()) == pytest.approx(total)
 
 
@@ -43,9 +47,8 @@ def test_steps_are_counted_as_they_were_done(written):
     assert spread_rows == [[8 * 8]] * 5
     junction_rows = [steps for (part, _), steps in rows.items() if part == "b"]
     assert junction_rows == [[4 * 8]] * 2
-    # What lies between the 8 steps of a rollout, by turns
     together = [steps for (part, _), steps in rows.items() if part == "together"]
-    assert together == [[8] * n for n in (3, 4, 3, 4)] + [[4] * n for n in (3, 4, 3, 4)]
+    assert together == [[8 * 8]] * 4 + [[4 * 8]] * 4
     if cores() > 1:
         assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [3 * 4 * 8]
         assert rows["cores", "2 teams"] == [2 * 3 * 4 * 8]
@@ -78,29 +81,83 @@ def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
     assert spread([4.0, 1.0, 2.0, 3.0, 5.0]) == (3.0, 2.0, 4.0)
 
 
+@pytest.mark.parametrize("rollouts", [1, 2])
+def test_the_phases_of_a_loop_are_all_of_its_time(rollouts):
+    loop = TeamLoop(spread_team("ippo", quick=True), rollouts)
+    measured = take(loop)
+    assert measured.steps == rollouts * 8 * 8
+    (phases,) = loop.phases
+    assert phases.keys() == set(PHASES)
+    assert all(sample.steps == measured.steps and sample.cpu > 0 and sample.wall > 0 for sample in phases.values())
+    # apart from what the two clocks themselves take
+    for clock in ("cpu", "wall"):
+        parts = sum(getattr(sample, clock) for sample in phases.values())
+        assert parts == pytest.approx(getattr(measured, clock), rel=0.05, abs=0.005)
+
+
+def test_a_phase_is_what_lies_between_the_marks_of_its_kind():
+    team = spread_team("ippo", quick=True)
+    env: Any = team.get_env()
+    models: list[Any] = list(team.agents.values())
+    waits = {"environment": 0.002, "update": 0.05}
+
+    def slow(method, seconds):
+        def call(*args):
+            time.sleep(seconds)
+            return method(*args)
+
+        return call
+
+    env.step = slow(env.step, waits["environment"])
+    for model in models:
+        model.train = slow(model.train, waits["update"])
+    loop = TeamLoop(team)
+    loop()
+    (environment,), (update,) = (time_of(loop.phases, name) for name in ("environment", "update"))
+    assert environment.wall - environment.cpu > 0.9 * 8 * waits["environment"]
+    assert update.wall - update.cpu > 0.9 * 3 * waits["update"]
+    (acting_time,) = time_of(loop.phases, "acting")
+    assert acting_time.wall - acting_time.cpu < waits["update"]
+    (rollout,) = time_of(loop.phases, "environment", "acting")
+    assert rollout.wall == environment.wall + acting_time.wall
+    found = milliseconds(loop.phases)
+    assert found["update"] == pytest.approx(1000 * update.cpu / update.steps)
+
+
+@pytest.mark.parametrize("make", [spread_team, junction_team])
+def test_acting_together_and_apart_learns_the_same(make):
+    team, other = make("belief_ppo", True), make("belief_ppo", True)
+    found = acting.compare(team, rollouts=2)
+    assert [len(samples) for samples in found.values()] == [2, 2]
+    loop = TeamLoop(other)
+    for _ in range(4):
+        loop()
+    for agent, model in team.agents.items():
+        for one, another in zip(model.policy.parameters(), other.agents[agent].policy.parameters(), strict=True):
+            assert th.equal(one, another)
+        assert not model.policy._forward_pre_hooks
+
+
 def test_updates_are_timed_by_themselves():
     report = Report(rounds=1, quick=True)
     gpu.run(report, ("cpu", "cpu"))
-    for way in ("lockstep", "stacked"):
-        assert report.ratio_rows[f"gpu_one_by_one_vs_{way}"]["median"] > 0
     assert report.time["update on cpu"]["ms_per_minibatch_of_all_agents"] > 0
     assert report.ratio_rows["gpu_vs_cpu_update"]["median"] > 0
 
 
-@pytest.mark.parametrize("way", [stacked.Stacked, stacked.InLockstep])
-def test_a_stacked_step_is_that_of_each_agent(way):
-    th.manual_seed(0)
-    policies = [stacked.make_policy("cpu") for _ in range(3)]
-    batches = [stacked.make_batch(16, "cpu") for _ in policies]
-    together, apart = way(policies, batches), stacked.OneByOne(policies, batches)
-    before = apart.weights()
-    together.steps(2)
-    apart.steps(2)
-    found, expected = together.weights(), apart.weights()
-    assert found.keys() == expected.keys()
-    for name, weights in expected.items():
-        th.testing.assert_close(found[name], weights, rtol=0, atol=1e-6)
-        assert (weights - before[name]).abs().amax(dim=tuple(range(1, weights.dim()))).min() > 1e-4
+@pytest.mark.parametrize("way", [batched_envs.batched, batched_envs.one_by_one])
+def test_steps_of_batched_and_of_single_copies_are_counted_alike(way):
+    assert way("traffic-junction-easy", n_envs=2, n_steps=50)() == 100
+
+
+def test_all_ways_of_attention_give_the_same():
+    queries, keys, values = (th.randn(n, 8, dtype=th.double) for n in (6, 20, 20))
+    selected = th.rand(6, 20).topk(4, dim=1).indices.sort(dim=1).values.int()
+    expected = attention.attend(queries, keys, values, selected)
+    for way in (attention.dense, attention.gathered):
+        for one, another in zip(way(queries, keys, values, selected), expected, strict=True):
+            th.testing.assert_close(one, another)
+        assert attention.passes(way, (6, 20, 4, 8))() == 4
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
@@ -120,8 +177,6 @@ def test_a_bar_that_is_missed_fails_nothing(capsys):
 
 
 def test_a_heavy_step_burns_its_own_time():
-    import time
-
     env = heavy.HeavyEnv("burns")
     env.reset()
     start = time.process_time()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.measure import Sample
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers.programs import Program
 
@@ -62,7 +61,7 @@ def test_programs_take_turns_and_one_that_dies_is_skipped(make, tmp_path, capsys
     assert all(0 <= about["idle_share_of_a_core"] < 0.5 for about in written["programs"].values())
     assert [row["steps"] for row in written["details"]["rows"]] == [[10] * 3] * 3
     assert written["ratios"]["ippo_vs_best_peer"] == written["ratios"]["ippo_vs_rival"] > 0
-    assert written["ratios"].keys() >= {"ippo_vs_best_peer_wall", "ippo_vs_best_peer_besides_env"}
+    assert written["ratios"].keys() == {"ippo_vs_best_peer", "ippo_vs_rival", "ippo_vs_best_peer_wall"}
     printed = capsys.readouterr().out
     assert "dies: skipped: ValueError: no more of dies" in printed
     assert "bar >= 2: " in printed
@@ -105,8 +104,3 @@ def test_a_library_without_its_environment_says_why(tmp_path, monkeypatch):
     assert program.error == "not installed: ERROR: no such version"
     program.start()
     assert program.samples == []
-
-
-def test_what_the_environments_take_is_taken_off():
-    env = [Sample(100, 1.0, 2.0), Sample(100, 2.0, 2.0)]
-    assert peers.besides([Sample(200, 5.0, 7.0), Sample(200, 5.0, 7.0)], env) == [Sample(200, 3.0, 3.0), Sample(200, 1.0, 3.0)]

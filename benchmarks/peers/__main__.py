@@ -1,19 +1,19 @@
 """
-How fast are other libraries at the same? Three independent PPOs with networks of their own on mpe2's simple_spread.
+How fast are other libraries at the same task? Three independent PPOs with networks of their own on mpe2's simple_spread.
 
     make bench-peers
     make bench-peers BENCH_ARGS="--rounds 9 --peers rllib"
 
-Everyone trains 8 copies x 128 steps, then 10 epochs of 4 minibatches, 64x64 tanh networks for the policy and the value, with
-one thread of torch on the CPU. Each program is a process in the environment of its library (see the files of this folder: they
-say where a library differs, and ``<library>.txt`` has its pins). All are started, and warmed up by one iteration, before any
-is measured; then they take turns, one iteration each, back and forth, and only one works at a time.
+Every program trains on 8 copies x 128 steps, then 10 epochs of 4 minibatches, with 64x64 tanh networks for the policy and the
+value, with one thread of torch on the CPU. Each program is a process in the environment of its library (see the files of this
+folder: they say where a library differs, and ``<library>.txt`` has its pins). All programs are started, and warmed up by one
+iteration, before any is measured. Then they take turns, one iteration each, back and forth, and only one works at a time.
 
-Speeds are joint steps (of one copy) per CPU second, of the program and all processes that it started, and per second on the
-wall. What was done in the first iteration is counted: steps of the environments and of the optimisers, and the parameters that
-these changed. The best peer is the fastest program here, also where it has a loop of ours. The environments alone are measured
-too, since nobody can be faster; ``..._besides_env`` are the ratios of what is left. A library that cannot be installed or that
-fails is skipped, saying why.
+Speeds are joint steps (of one copy) per CPU second, of the program and all processes that it started, and per second of
+wall-clock time. The work of the first iteration is counted: steps of the environments and of the optimisers, and the
+parameters that these changed. The best peer is the fastest program of another library, even with a loop of ours. The
+environments alone are measured, too, since no program can be faster. A library that cannot be installed, or that fails, is
+skipped, and the report says why.
 """
 
 import argparse
@@ -31,7 +31,7 @@ OUT = ROOT / "benchmarks" / "out" / "peers.json"
 VENVS = ROOT / ".venv-peers"
 #: By key of their ratios: name, arguments of the program
 OURS = {"ippo": ("team of ippo", "ippo"), "ppo": ("team of ppo", "ppo"), "by_hand": ("three PPOs by hand", "by_hand")}
-#: Name, library, further arguments of its program
+#: By key of their ratios: name, library, further arguments of the program
 PEERS = {
     "rllib": ("RLlib", "rllib"),
     "agilerl": ("AgileRL, copies in a loop of ours", "agilerl"),
@@ -41,16 +41,14 @@ PEERS = {
 
 
 class PeerReport(Report):
-    """What is measured here, printed as ``make bench`` does."""
+    """Report of the comparison, printed as ``make bench`` does."""
 
     bars = MappingProxyType({"ippo_vs_best_peer": (">=", 2.0), "ppo_vs_best_peer": (">=", 2.0)})
 
     def add_programs(self, programs: Mapping[str, Program]) -> None:
-        """
-        :param programs: that were measured
-        """
+        """Add programs that were measured, by key."""
         self.add_samples("peers", {program.name: program.samples for program in programs.values()}, "joint steps")
-        print("  in the first iteration; CPU time while others work:")
+        print("  work of the first iteration; CPU time while others work:")
         for key, program in programs.items():
             self.time[key] = {**program.about, "idle_share_of_a_core": program.idle_share}
             work = ", ".join(f"{number:,} {what.replace('_', ' ')}" for what, number in program.about.get("work", {}).items())
@@ -58,7 +56,7 @@ class PeerReport(Report):
 
     def add_ratio(self, key: str, found: Spread, text: str) -> None:
         super().add_ratio(key, found, text)
-        # Not only those with a bar: which library is the best one may change
+        # Also those without a bar, since the best library may be another one next time
         self.ratios[key] = found.median
 
     def write(self, path: Path) -> None:
@@ -69,18 +67,18 @@ class PeerReport(Report):
 
 def compare(report: PeerReport, ours: Mapping[str, Program], peers: Mapping[str, Program], env: Program) -> None:
     """
-    Start all, measure those that work in turns, and stop them.
+    Start all programs, measure those that work in turns, and stop them.
 
-    :param report: what is found goes there
-    :param ours: our programs, by key
-    :param peers: those of others, by key
-    :param env: the environments alone
+    :param report: Receives the results
+    :param ours: Our programs, by key
+    :param peers: The programs of other libraries, by key
+    :param env: The environments alone
     """
     programs = {**ours, **peers, "env": env}
     try:
         for program in programs.values():
             program.start()
-        # Who fails in the middle does nothing in later turns
+        # A program that fails in the middle does nothing in later turns
         alternate({key: each.turn for key, each in programs.items() if each.error is None}, report.rounds, warmup=0)
     finally:
         for program in programs.values():
@@ -93,23 +91,8 @@ def compare(report: PeerReport, ours: Mapping[str, Program], peers: Mapping[str,
         report.add_programs(working)
     samples = {key: program.samples for key, program in working.items()}
     names = {key: program.name for key, program in working.items()}
-    add_ratios(report, samples, names, list(ours), list(peers))
-    add_ratios(report, samples, names, list(ours), list(peers), "wall", "_wall", ", on the wall")
-    if "env" in working:
-        rest = {key: besides(taken, samples["env"]) for key, taken in samples.items() if key != "env"}
-        add_ratios(report, rest, names, list(ours), list(peers), "cpu", "_besides_env", ", without what the environments take")
-
-
-def besides(samples: Sequence[Sample], env: Sequence[Sample]) -> list[Sample]:
-    """
-    :param samples: measurements of a program
-    :param env: of the environments alone, in the same rounds
-    :return: what the program takes besides
-    """
-    return [
-        Sample(own.steps, own.cpu - each.cpu * own.steps / each.steps, own.wall - each.wall * own.steps / each.steps)
-        for own, each in zip(samples, env, strict=True)
-    ]
+    for clock in ("cpu", "wall"):
+        add_ratios(report, samples, names, list(ours), list(peers), clock)
 
 
 def add_ratios(
@@ -118,37 +101,31 @@ def add_ratios(
     names: Mapping[str, str],
     ours: Sequence[str],
     peers: Sequence[str],
-    clock: str = "cpu",
-    end: str = "",
-    words: str = "",
+    clock: str,
 ) -> None:
     """
-    :param report: what is found goes there
-    :param samples: measurements, by key
-    :param names: by key
-    :param ours: keys of ours, of which some may be missing
-    :param peers: keys of the others, of which some may be missing
+    Add the ratio of each of our programs to the best peer and, of CPU time, to each other one.
+
+    :param report: Receives the ratios
+    :param samples: Measurements, by key
+    :param names: Names of the programs, by key
+    :param ours: Keys of our programs, some of which may be missing
+    :param peers: Keys of the peers, some of which may be missing
     :param clock: ``"cpu"`` or ``"wall"``
-    :param end: of the keys of these ratios; with one, only those to the best peer are added
-    :param words: about all of them
     """
     rivals = {key: statistics.median(speeds(samples[key], clock)) for key in peers if key in samples}
+    end, words = ("_wall", ", wall-clock time") if clock == "wall" else ("", "")
     for key in [key for key in ours if key in samples and rivals]:
         for rank, rival in enumerate(sorted(rivals, key=lambda rival: -rivals[rival])):
             found, text = ratio(samples[key], samples[rival], clock), f"{names[key]} / {names[rival]}{words}"
             if rank == 0:
                 report.add_ratio(f"{key}_vs_best_peer{end}", found, text)
-            if not end:
+            if clock == "cpu":
                 report.add_ratio(f"{key}_vs_{rival}", found, text)
 
 
 def peer(name: str, library: str, *arguments: str) -> Program:
-    """
-    :param name: of what is measured
-    :param library: whose environment and program it is
-    :param arguments: of the program
-    :return: the program
-    """
+    """Return a program of another library, which runs in the environment of this library."""
     program = Program(name, [str(VENVS / library / "bin" / "python"), "-m", f"benchmarks.peers.{library}", *arguments])
     if not (VENVS / library / ".installed").exists():
         log = VENVS / f"{library}.log"
@@ -158,11 +135,7 @@ def peer(name: str, library: str, *arguments: str) -> Program:
 
 
 def our(name: str, *arguments: str) -> Program:
-    """
-    :param name: of what is measured
-    :param arguments: of the program
-    :return: the program
-    """
+    """Return a program of ours."""
     return Program(name, [sys.executable, "-m", "benchmarks.peers.ours", *arguments])
 
 
@@ -170,14 +143,14 @@ def main(arguments: list[str] | None = None) -> None:
     """
     Measure, print and write.
 
-    :param arguments: of the command line
+    :param arguments: Arguments of the command line
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--peers", nargs="+", choices=PEERS, default=list(PEERS), metavar="PEER", help="of " + ", ".join(PEERS)
+        "--peers", nargs="+", choices=PEERS, default=list(PEERS), metavar="PEER", help="some of " + ", ".join(PEERS)
     )
-    parser.add_argument("--rounds", type=int, default=None, help="measurements of each (default 7; 1 if quick)")
-    parser.add_argument("--quick", action="store_true", help="everything tiny, to see that it runs: the numbers mean nothing")
+    parser.add_argument("--rounds", type=int, default=None, help="measurements of each program (default 7; 1 with --quick)")
+    parser.add_argument("--quick", action="store_true", help="make everything tiny, as a test: the numbers mean nothing")
     parser.add_argument("--out", type=Path, default=OUT, help="the JSON file")
     args = parser.parse_args(arguments)
     quick = ["--quick"] * args.quick

@@ -2,14 +2,14 @@
 AgileRL's IPPO, run by ``benchmarks.peers`` in an environment of its own.
 
 The loop over steps is that of its documentation and of ``train_multi_agent_on_policy``, without scores, evaluation and
-mutation. AgileRL's own vectorised environment puts every copy into a process (``--processes``). This workload is faster with
-``Copies``, a plain loop over them in this process, which AgileRL does not have; both are measured. Agents whose names differ
-by a number only would share networks; here each has its own, with two layers of 64 (AgileRL's own have at least three, hence
-``Layer``).
+mutation. AgileRL's own vectorised environment runs every copy in a process (``--processes``). This workload is faster with
+``Copies``, a plain loop over them in this process, which AgileRL does not have; both are measured. By default, agents whose
+names differ only by a number share networks. Here each has its own, with two layers of 64 units (``Layer`` is needed because
+AgileRL's own networks have at least three layers).
 
-What differs: the policy and the value network have an Adam each, clipped apart, and the value's loss is clipped; an end by the
-time limit counts as the end of the return, where the others ask the value network. Its import needs peft, which it does not
-require.
+What differs: the policy and the value network each have an Adam and a clipped gradient of their own, and the value loss is
+clipped, too. An end by the time limit counts as the end of the return, where the others bootstrap from the value network. The
+import needs peft, which AgileRL does not list as a requirement.
 """
 
 import argparse
@@ -31,15 +31,15 @@ from benchmarks.peers.child import Turns, Workload, workload
 
 class Layer(EvolvableModule):
     """
-    The first layer, as the encoder: the head has the second one.
+    First layer of a network, as its encoder; the head has the second layer.
 
-    :param num_inputs: width of an observation
-    :param num_outputs: width of the layer
+    :param num_inputs: Width of an observation
+    :param num_outputs: Width of the layer
     """
 
     def __init__(self, num_inputs: int, num_outputs: int) -> None:
         super().__init__(device="cpu")
-        # AgileRL clones a module by reading its arguments from it
+        # AgileRL clones a module by reading its constructor's arguments from attributes
         self.num_inputs, self.num_outputs = num_inputs, num_outputs
         self.net = nn.Sequential(nn.Linear(num_inputs, num_outputs), nn.Tanh())
 
@@ -56,7 +56,7 @@ class Layer(EvolvableModule):
 
 
 class SeparateIPPO(IPPO):
-    """Agents with names like agent_0 and agent_1 are not of one group."""
+    """IPPO in which agents with names like agent_0 and agent_1 are not put into one group."""
 
     def get_group_id(self, agent_id: str) -> str:
         return agent_id
@@ -64,9 +64,9 @@ class SeparateIPPO(IPPO):
 
 class Copies(PettingZooVecEnv):
     """
-    Copies of simple_spread, one after the other, in this process.
+    Vectorised environment that steps copies of simple_spread one after the other in this process.
 
-    :param n_envs: number of copies
+    :param n_envs: Number of copies
     """
 
     def __init__(self, n_envs: int) -> None:
@@ -92,16 +92,12 @@ class Copies(PettingZooVecEnv):
 
 
 def learners(env: PettingZooVecEnv, work: Workload) -> IPPO:
-    """
-    :param env: where they learn
-    :param work: what to train
-    :return: three learners
-    """
+    """Return the three learners for the workload."""
     first, second = work.hidden
     actors, critics = ModuleDict(), ModuleDict()
     for agent in env.agents:
         obs_space, action_space = env.single_observation_space(agent), env.single_action_space(agent)
-        # AgileRL changes the settings of a head in place
+        # One dict each, since AgileRL changes the settings of a head in place
         heads = [{"hidden_size": [second], "activation": "Tanh", "layer_norm": False} for _ in range(2)]
         encoders = [Layer(obs_space.shape[0], first) for _ in range(2)]
         actors[agent] = StochasticActor(obs_space, action_space, encoder=encoders[0], head_config=heads[0])
@@ -126,7 +122,7 @@ def learners(env: PettingZooVecEnv, work: Workload) -> IPPO:
 
 
 def main() -> None:
-    """Train until nobody asks any more."""
+    """Train until there are no more requests."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--processes", action="store_true", help="AgileRL's own vectorised environment")
     work, args = workload(parser)
@@ -137,7 +133,7 @@ def main() -> None:
     obs, info = env.reset()
     done = {agent: np.zeros(work.n_envs) for agent in env.agents}
     while True:
-        # States, actions, log probabilities, rewards, ends and values of each agent
+        # Observations, actions, log probabilities, rewards, dones and values of each agent
         rollout: tuple[dict[str, list], ...] = tuple({agent: [] for agent in env.agents} for _ in range(6))
         for _ in range(work.n_steps):
             action, log_prob, _, value = algorithm.get_action(obs, info)

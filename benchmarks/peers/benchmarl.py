@@ -1,12 +1,12 @@
 """
 BenchMARL's IPPO over TorchRL, run by ``benchmarks.peers`` in an environment of its own.
 
-The copies are stepped in this process (``SerialEnv``, its default); no logger, no evaluation, no rendering, no checkpoint. The
-agents are one group in which each has networks of its own: that takes less time than a group for each, since the networks of
-all three are asked and updated at once.
+The copies are stepped in this process (``SerialEnv``, its default), without logger, evaluation, rendering and checkpoints. The
+agents are one group in which each has networks of its own. This is faster than a group for each agent, since the networks of
+all three are evaluated and updated at once.
 
-What differs: one Adam for the policies and one for the value networks of all three, clipped apart from each other but not for
-each agent; a minibatch has the same 256 steps for all; advantages are not normalised.
+What differs: there is one Adam for the policies and one for the value networks of all three, with gradients clipped for each
+of the two but not for each agent; a minibatch has the same 256 steps for all agents; advantages are not normalised.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ from benchmarks.peers.child import Turns, workload
 
 
 class Spread(PettingZooClass):
-    """BenchMARL's own task imports what PettingZoo no longer has; the environment is the same."""
+    """The task, since BenchMARL's own one imports a module that PettingZoo no longer has. The environment is the same."""
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], EnvBase]:
         return lambda: PettingZooWrapper(
@@ -41,10 +41,10 @@ class Spread(PettingZooClass):
 
 class Ends(Callback):
     """
-    Answers after each update, which is that of the last group.
+    Callback that answers after each update, which ends with that of the last group.
 
-    :param turns: what to tell it to
-    :param steps: joint steps of an iteration
+    :param turns: Sends the answer
+    :param steps: Joint steps of an iteration
     """
 
     def __init__(self, turns: Turns, steps: int) -> None:
@@ -52,7 +52,7 @@ class Ends(Callback):
         self.turns, self.steps = turns, steps
 
     def __getstate__(self) -> dict[str, Any]:
-        # BenchMARL writes its callbacks to a file
+        # BenchMARL pickles its callbacks
         return {}
 
     def on_train_end(self, training_td: Any, group: str) -> None:
@@ -61,7 +61,7 @@ class Ends(Callback):
 
 
 def main() -> None:
-    """Train until nobody asks any more."""
+    """Train until there are no more requests."""
     work, _ = workload()
     turns = Turns("benchmarl", "torchrl")
     config = ExperimentConfig.get_from_yaml()

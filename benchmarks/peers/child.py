@@ -1,9 +1,9 @@
 """
-What every compared program shares: the workload, and how it answers. Only the standard library, PyTorch and mpe2 are needed
-here, which every peer's environment has.
+What all compared programs share: the workload, and how they answer.
 
-A program trains iteration after iteration (a rollout and the update after it) and calls ``Turns.end`` after each. It then
-waits until it is asked for the next one, so that only one program runs at a time.
+This needs only the standard library, PyTorch and mpe2, which the environment of every peer has. A program trains iteration
+after iteration (a rollout and the update after it) and calls ``Turns.end`` after each. That waits for the request for the next
+iteration, so that only one program runs at a time.
 """
 
 import argparse
@@ -20,8 +20,8 @@ class Workload:
     """
     Independent PPO on simple_spread, with the defaults of Stable-Baselines3's PPO.
 
-    :param n_steps: of each copy in a rollout
-    :param n_epochs: passes over the rollout in an update
+    :param n_steps: Steps of each copy in a rollout
+    :param n_epochs: Passes over the rollout in an update
     """
 
     n_steps: int = 128
@@ -38,17 +38,17 @@ class Workload:
 
     @property
     def rows(self) -> int:
-        """Rows of a rollout, of each agent: its joint steps."""
+        """Rows of each agent in a rollout, which are its joint steps."""
         return self.n_envs * self.n_steps
 
     @property
     def batch_size(self) -> int:
-        """Rows of a minibatch, of each agent."""
+        """Rows of each agent in a minibatch."""
         return self.rows // self.n_minibatches
 
 
 class Count:
-    """What was really done in the first iteration: a peer's settings may mean something else than they seem to."""
+    """Count of the work that is really done, since a peer's settings may not mean what they seem to mean."""
 
     def __init__(self) -> None:
         import torch.optim.optimizer as optimizers
@@ -72,24 +72,28 @@ class Count:
 
     def stop(self) -> dict[str, int]:
         """
-        :return: steps of all copies together, steps of all optimisers and the parameters that these changed, each time anew;
-            all of this process only
+        Stop counting.
+
+        :return: Steps of all copies, steps of all optimisers, and parameters that these changed, summed over their steps. All
+            are those of this process only
         """
         self._restore()
         self._hook.remove()
-        # None were seen where other processes step the environments
+        # Where other processes step the environments, none of their steps were seen here
         return {name: number for name, number in self.work.items() if number > 0}
 
 
 class Turns:
     """
-    Answers on standard output, one line of JSON for each iteration. The first is the warm-up, whose answer says what was done.
+    Answers on standard output, one line of JSON after each iteration.
 
-    :param packages: whose versions to tell
+    The first iteration is the warm-up. Its answer also has the versions and the work that was done.
+
+    :param packages: Packages whose versions to report
     """
 
     def __init__(self, *packages: str) -> None:
-        # What a library prints goes to where the errors go
+        # What a library prints is sent to standard error, so that it does not mix with the answers
         self._answers = os.fdopen(os.dup(1), "w")
         os.dup2(2, 1)
         import torch
@@ -99,9 +103,7 @@ class Turns:
         self._count: Count | None = Count()
 
     def end(self, steps: int) -> None:
-        """
-        :param steps: joint steps of the iteration that has ended
-        """
+        """Answer that an iteration of so many joint steps has ended, and wait for the next request."""
         answer: dict[str, Any] = {"steps": steps}
         if self._count is not None:
             answer |= {"versions": self._versions, "work": self._count.stop()}
@@ -112,10 +114,7 @@ class Turns:
 
 
 def workload(parser: argparse.ArgumentParser | None = None) -> tuple[Workload, argparse.Namespace]:
-    """
-    :param parser: of a program with arguments of its own
-    :return: what to train, and all arguments of the command line
-    """
+    """Return the workload and all arguments of the command line, given the parser of a program with arguments of its own."""
     parser = parser or argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="a tiny rollout and one epoch")
     args = parser.parse_args()

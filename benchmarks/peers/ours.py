@@ -1,5 +1,5 @@
 """
-Our programs on the same workload (those of ``make bench``, part a), run as the peers are; and the environments alone.
+Our programs on the same workload (those of ``make bench``, part a), run as the peers are, and the environments alone.
 
     python -m benchmarks.peers.ours ippo
 """
@@ -15,21 +15,14 @@ from benchmarks.teams import SPREAD_ENVS, TeamLoop, spread_settings, spread_team
 
 
 def make(name: str, quick: bool) -> Loop:
-    """
-    :param name: ``"ippo"`` or ``"ppo"``, a team of them, or ``"by_hand"``: stock PPOs without a team
-    :param quick: a tiny rollout and one epoch
-    :return: trains for one iteration
-    """
+    """Return the loop of a program: a team of ``"ippo"`` or ``"ppo"``, or stock PPOs without a team (``"by_hand"``)."""
     if name == "by_hand":
-        return ByHand(SPREAD_ENVS, spread_settings(quick)).iterate
+        return ByHand(SPREAD_ENVS, spread_settings(quick))
     return TeamLoop(spread_team(name, quick))
 
 
 def environments(work: Workload) -> Loop:
-    """
-    :param work: how many steps of how many copies
-    :return: steps them and nothing else, the same action for all: what nobody can be faster than
-    """
+    """Return a loop that only steps the environments, always with the same action. No program can be faster."""
     envs = [simple_spread_v3.parallel_env() for _ in range(work.n_envs)]
     actions = dict.fromkeys(envs[0].possible_agents, 1)
     for env in envs:
@@ -47,7 +40,7 @@ def environments(work: Workload) -> Loop:
 
 
 def main() -> None:
-    """Train until nobody asks any more."""
+    """Train until there are no more requests."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=("ippo", "ppo", "by_hand", "env"))
     work, args = workload(parser)

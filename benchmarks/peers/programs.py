@@ -1,4 +1,4 @@
-"""Programs that train in processes of their own, one at a time, whenever they are asked."""
+"""Programs that train in processes of their own, one iteration at a time, on request."""
 
 import json
 import os
@@ -16,20 +16,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class ProgramError(RuntimeError):
-    """A program that did not answer."""
+    """Error for a program that did not answer."""
 
 
 def tree_cpu_seconds(pid: int) -> float:
     """
-    :param pid: of a process
-    :return: CPU time so far of it, of all that descend from it, and of those of them that have ended. It comes from /proc, in
-        ticks of 10 ms: on Linux only
+    Return the CPU time so far of a process, of all its descendants, and of those among them that have ended.
+
+    It is read from /proc, in ticks of 10 ms, so on Linux only.
     """
     children: dict[int, list[int]] = {}
     times: dict[int, int] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
-            # Behind the name, which may hold blanks: the 4th field of all is the parent, the 14th to 17th are times
+            # After the name, which may contain spaces: field 4 of the line is the parent, fields 14 to 17 are times
             fields = path.read_text().rpartition(")")[2].split()
         except (FileNotFoundError, ProcessLookupError):
             continue
@@ -46,30 +46,30 @@ def tree_cpu_seconds(pid: int) -> float:
 
 class Program:
     """
-    A process that answers as ``benchmarks.peers.child`` says.
+    Process that answers in the way of ``benchmarks.peers.child``.
 
-    :param name: for people
-    :param command: that starts it
-    :param seconds: how long an answer may take; the process is ended then
+    :param name: Name in the report
+    :param command: Command that starts it
+    :param seconds: How long an answer may take. After that the process is ended
     """
 
     def __init__(self, name: str, command: Sequence[str], seconds: float = 300) -> None:
         self.name = name
         self.command = list(command)
         self.seconds = seconds
-        #: Its first answer: versions, and what was done in the first iteration
+        #: The first answer: versions, and the work that the first iteration did
         self.about: dict[str, Any] = {}
         self.samples: list[Sample] = []
-        #: Why it cannot go on
+        #: Why the program was stopped, if it was
         self.error: str | None = None
         self._process: subprocess.Popen[str] | None = None
         self._errors = tempfile.TemporaryFile("w+")
-        # CPU time that it took and seconds that passed while others had their turns
+        # CPU seconds that it took, and wall-clock seconds that passed, while other programs had their turns
         self._idle = [0.0, 0.0]
         self._last = (0.0, 0.0)
 
     def start(self) -> None:
-        """Start it and wait for its first answer. What goes wrong, here or in a turn, is in ``error``; then it rests."""
+        """Start the process and wait for its first answer. After a failure, here or in a turn, ``error`` says why."""
         if self.error is not None:
             return
         threads = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
@@ -89,11 +89,7 @@ class Program:
             self._fail(error)
 
     def turn(self) -> int:
-        """
-        Let it train for one iteration, and note what that took.
-
-        :return: joint steps that it did
-        """
+        """Let the program train for one iteration, add a sample, and return the number of joint steps."""
         process = self._process
         if process is None or process.stdin is None or self.error is not None:
             return 0
@@ -114,11 +110,11 @@ class Program:
 
     @property
     def idle_share(self) -> float:
-        """Share of a core that it takes while others have their turns."""
+        """Share of a core that the program takes while others have their turns."""
         return self._idle[0] / max(self._idle[1], 1e-9)
 
     def stop(self) -> None:
-        """End it."""
+        """End the process."""
         process = self._process
         if process is None:
             return

@@ -1,18 +1,18 @@
 """
 RLlib's PPO (new API stack), run by ``benchmarks.peers`` in an environment of its own.
 
-As fast as RLlib can do this within one process: the local env runner steps all copies in one vector and the local learner
-updates, so there are neither remote env runners nor remote learners. One policy per agent, no observation filter, no KL
-penalty, no evaluation. Ray starts its services all the same; their CPU time counts.
+This is the fastest way of RLlib within one process: the local env runner steps all copies in one vector and the local learner
+updates, without remote env runners and learners. There is one policy per agent, no observation filter, no KL penalty and no
+evaluation. Ray starts its services all the same, and their CPU time counts.
 
-What differs: RLlib adds a row for the value at the end of each episode, so that a rollout of 1,024 rows is 42 minibatches of
-256 in 10 epochs and not 40 (it cannot be told to leave these out), and it asks the value network only before the update, for
-all rows at once. Before its first rollout it steps each copy once to check it.
+What differs: RLlib adds a row for the value at the end of each episode, so that 10 epochs over a rollout of 1,024 rows are 42
+minibatches of 256 and not 40 (there is no setting against it). It evaluates the value network only before the update, for all
+rows at once. Before its first rollout it steps each copy once, as a check.
 """
 
 import os
 
-# Before ray is imported: no reports to anyone, and none of its log lines among the errors
+# Before ray is imported: no usage reports, and no deduplicated log lines among the errors
 os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 
 import ray
@@ -26,10 +26,7 @@ from benchmarks.peers.child import Turns, Workload, workload
 
 
 def config(work: Workload) -> PPOConfig:
-    """
-    :param work: what to train
-    :return: RLlib's settings for it
-    """
+    """Return RLlib's settings for the workload."""
     agents = simple_spread_v3.parallel_env().possible_agents
     return (
         PPOConfig()
@@ -60,7 +57,7 @@ def config(work: Workload) -> PPOConfig:
 
 
 def main() -> None:
-    """Train until nobody asks any more."""
+    """Train until there are no more requests."""
     work, _ = workload()
     turns = Turns("ray")
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, configure_logging=False)

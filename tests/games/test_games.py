@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from benchmarks.games import BELIEFS, GAMES, HISTORY, Played, play, play_all
+from studies.games import BELIEFS, GAMES, HISTORY, Played, play, play_all
 
 SEEDS = range(5)
 CHANCE = 0.25

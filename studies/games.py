@@ -1,11 +1,12 @@
 """
 The games that prove a belief dynamic (sb3_belief.envs.SwitchingConvention), for all variants and seeds.
 
-    python benchmarks/games.py --jobs 2
+    python -m studies.games --jobs 2
+    python -m studies.games --games swap --beliefs dynamic none --seeds 0
 
-trains the YAML entries of zoo_configs/belief_ppo.yml, the same for all variants, and prints for each game and variant the
-success of every seed beside what can be had. Success is the share of steps in which the follower plays what the leader plays;
-by chance it is 1/4. `--games swap --beliefs dynamic none --seeds 0` plays a part of it.
+trains the YAML entries of zoo_configs/belief_ppo.yml, the same for all variants, and prints the success of every seed for each
+game and variant beside the best possible one. Success is the share of steps in which the follower plays what the leader plays;
+by chance it is 1/4.
 """
 
 import argparse
@@ -29,19 +30,21 @@ from sb3_belief.zoo.train import TrainOptions, make_env, make_team
 FOLLOWER = "follower"
 HISTORY = ("dynamic", "context")
 BELIEFS = (*HISTORY, "variational", "static", "wide", "none")
-# Conventions from here on are met in no training
+# No training uses conventions with seeds from here on
 FRESH_SEEDS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Game:
     """
+    A game, and how it is played.
+
     :param env_id: The environment, whose YAML entry is trained
-    :param best: The best success there is
+    :param best: The best possible success
     :param what: What is measured
-    :param beliefs: The variants that are played
-    :param rollouts: How many rollouts are trained, None for the YAML entry's
-    :param env_kwargs: What differs from the environment's id
+    :param beliefs: The variants of the belief that are compared
+    :param rollouts: Number of rollouts of the training, None for that of the YAML entry
+    :param env_kwargs: Arguments of the environment that differ from the YAML entry
     """
 
     env_id: str
@@ -75,9 +78,11 @@ GAMES = {
 
 class Played(NamedTuple):
     """
-    :param success: See the game
-    :param history_gain: Of the rollouts whose history is of their own convention, the mean over the last quarter of the
-        training; 0 for a belief without a history
+    Result of one run.
+
+    :param success: Success as the game measures it
+    :param history_gain: Mean over the last quarter of the training, of the rollouts whose history shows their own convention;
+        0 for a belief without a history
     :param curve: Success in each rollout of the training
     :param seconds: CPU seconds
     """
@@ -89,7 +94,7 @@ class Played(NamedTuple):
 
 
 class _Record(BaseCallback):
-    """Success and history gain of each rollout."""
+    """Callback that records the success of each step and the history gain of each rollout."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,24 +102,26 @@ class _Record(BaseCallback):
         self.gains: list[float] = []
 
     def _on_step(self) -> bool:
-        # Not the rewards, which do not count everywhere
+        # Actions are compared, since not every game gives rewards in all of its steps
         actions, leader = self.locals["actions"], np.array([info["scripted_actions"] for info in self.locals["infos"]])
         self.hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
         return True
 
     def _on_rollout_start(self) -> None:
-        # What was logged in the update before
+        # The value that the last update logged
         model = self.model.agents[FOLLOWER]  # type: ignore[attr-defined]
         self.gains.append(float(model.logger.name_to_value.get("belief/history_gain", 0.0)))
 
 
 def play(name: str, belief: str, seed: int, rollouts: int | None = None) -> Played:
     """
+    Train a team in a game and measure its success.
+
     :param name: A key of ``GAMES``
-    :param belief: The variant
-    :param seed: Of team, cues and conventions
-    :param rollouts: How many rollouts are trained, instead of the game's
-    :return: What came of it
+    :param belief: The variant of the belief
+    :param seed: Seed of the team, the cues and the conventions
+    :param rollouts: Number of rollouts of the training, instead of the game's
+    :return: The result
     """
     th.set_num_threads(1)
     start = time.process_time()
@@ -139,7 +146,7 @@ def play(name: str, belief: str, seed: int, rollouts: int | None = None) -> Play
         success = curve[phase == 1][-20:].mean()
     else:
         success = curve[-{"redraw": 25, "redraw-each": 50, "stationary": 10}[name] :].mean()
-    # gains[k] was measured in the update on rollout k - 1, whose history is of the rollout before it
+    # gains[k] was measured in the update on rollout k - 1, whose history comes from the rollout before that
     gains = np.array(record.gains[1:])
     own = (phase > 0) & (np.arange(n_rollouts) >= 0.75 * n_rollouts)
     gain = gains[own].mean() if own.any() else gains[-n_rollouts // 4 :].mean()
@@ -148,13 +155,13 @@ def play(name: str, belief: str, seed: int, rollouts: int | None = None) -> Play
 
 def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterable[str]) -> float:
     """
-    What a deployed agent does among changed teammates: it watches, and its history is all that changes.
+    Measure how an agent that no longer learns adapts to new teammates: it watches them, and only its history changes.
 
     :param team: A trained team
-    :param n_envs: Copies of the environment
-    :param n_steps: Steps of watching, and then of acting
-    :param env_kwargs: Of the game
-    :return: Success over the fresh conventions, greedy
+    :param n_envs: Number of copies of the environment
+    :param n_steps: Number of steps of watching, and then of acting
+    :param env_kwargs: Arguments of the game's environment
+    :return: Success of greedy actions over all conventions, each from a seed that the training did not use
     """
     model: BeliefPPO = team.agents[FOLLOWER]  # type: ignore[assignment]
     weights = {name: value.clone() for name, value in model.policy.named_parameters()}
@@ -165,7 +172,7 @@ def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterabl
         fresh: dict[str, Any] = {"K": None, "seed": seed, "rollout_steps": n_steps, "leader_visible": visible}
         env = make_team_env("convention-swap", n_envs=n_envs, seed=seed, env_kwargs=fresh)
         convention = tuple(env.get_attr("convention")[0])
-        # Each once: then no policy without a history is better at all of them together than another
+        # Each convention once: over all of them together, no policy without a history is better than chance
         if convention in met:
             continue
         met.add(convention)
@@ -191,11 +198,13 @@ def play_all(
     names: Iterable[str], beliefs: Iterable[str], seeds: Iterable[int], jobs: int = 1, rollouts: int | None = None
 ) -> dict[tuple[str, str], list[Played]]:
     """
+    Play games with several variants and seeds.
+
     :param names: Keys of ``GAMES``
-    :param beliefs: Variants, of those that each game is played with
-    :param seeds: Of the runs
-    :param jobs: Processes
-    :param rollouts: How many rollouts are trained, instead of the games'
+    :param beliefs: Variants of the belief; each game is played with those among them that it compares
+    :param seeds: Seeds of the runs
+    :param jobs: Number of processes
+    :param rollouts: Number of rollouts of the training, instead of the games'
     :return: ``{(game, variant): [result of each seed]}``
     """
     beliefs, seeds = list(beliefs), list(seeds)
@@ -215,7 +224,7 @@ def main() -> None:
     args = parser.parse_args()
     total = 0.0
     for name in args.games:
-        print(f"\n{name}: {GAMES[name].what}; the best there is: {GAMES[name].best}")
+        print(f"\n{name}: {GAMES[name].what}; best possible: {GAMES[name].best}")
         for (_, belief), results in play_all([name], args.beliefs, args.seeds, args.jobs).items():
             values = "  ".join(f"{result.success:.3f}" for result in results)
             mean, gain = np.mean([r.success for r in results]), np.mean([r.history_gain for r in results])

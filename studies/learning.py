@@ -1,14 +1,13 @@
 """
-Train the full YAML entry of an environment with several beliefs and seeds, side by side, and measure the final teams on
-episodes of their own.
+Train the full YAML entry of an environment with several beliefs and seeds, and compare the final teams.
 
-    python benchmarks/learning.py --env traffic-junction-medium --beliefs dynamic none --seeds 0 1 2
-    python benchmarks/learning.py --env lbf/Foraging-2s-8x8-2p-2f-coop-v3 --plot lbf.png
-    python benchmarks/learning.py --algo maskable_belief_ppo --env smax/3m --quantity success --plot 3m.png
+    python -m studies.learning --env traffic-junction-medium --beliefs dynamic none --seeds 0 1 2
+    python -m studies.learning --env lbf/Foraging-2s-8x8-2p-2f-coop-v3 --plot lbf.png
+    python -m studies.learning --algo maskable_belief_ppo --env smax/3m --quantity success --plot 3m.png
 
-prints a row per run: joint steps; over 1,024 episodes the return and the success rate of the policies as they are (sampled),
-then greedy; CPU seconds of the training, and the run's folder. Belief "none" is IPPO. A run that is already finished in the
-log folder is not trained again, so that a long comparison can be made in pieces; `--plot` draws all of them.
+prints a row for each run: the joint steps; return and success rate over 1,024 episodes that the training did not use, with
+sampled and then with greedy actions; the CPU seconds of the training; and the run's folder. Belief "none" is IPPO. A run that
+the log folder already has is not trained again, so that a long comparison can be made in pieces. `--plot` draws all runs.
 """
 
 import argparse
@@ -30,7 +29,7 @@ from sb3_belief.zoo.evaluate import evaluate
 from sb3_belief.zoo.run_folder import folder_name
 from sb3_belief.zoo.train import TrainOptions, make_env, train
 
-# Episodes that neither the training nor its evaluations see
+# Seed of episodes that neither the training nor its evaluations use
 MEASURE_SEED = 9_000_000
 _COLUMNS = (
     f"{'belief':<12} {'seed':>4} {'joint steps':>12}   "
@@ -41,13 +40,15 @@ _COLUMNS = (
 @dataclass(frozen=True)
 class Learned:
     """
-    :param belief: what was trained
-    :param seed: of the run
-    :param timesteps: joint steps it was trained for
-    :param sampled: mean return, success rate and its standard error (None where the environment does not say)
-    :param greedy: the same of the most likely actions
+    Result of one run.
+
+    :param belief: Variant of the belief
+    :param seed: Seed of the run
+    :param timesteps: Joint steps of the training
+    :param sampled: Mean return, success rate and its standard error (None if the environment reports no success)
+    :param greedy: The same with the most likely actions
     :param seconds: CPU seconds of the training
-    :param folder: of the run
+    :param folder: Folder of the run
     """
 
     belief: str
@@ -69,17 +70,19 @@ def learn(
     belief: str, seed: int, algo: str, env_id: str, n_timesteps: int | None, episodes: int, log_folder: str
 ) -> Learned | None:
     """
-    :param belief: a variant of the belief
-    :param seed: of team and environment
-    :param algo: algorithm, one with a belief
-    :param env_id: environment
-    :param n_timesteps: joint steps, None for the YAML entry's
-    :param episodes: episodes of each measure
-    :param log_folder: folder of all runs
-    :return: what came of it, None if it was interrupted
+    Train a team and evaluate it, unless the log folder has the result already.
+
+    :param belief: Variant of the belief
+    :param seed: Seed of the team and its environment
+    :param algo: Algorithm with a belief
+    :param env_id: Id of the environment
+    :param n_timesteps: Joint steps, None for those of the YAML entry
+    :param episodes: Number of episodes of each evaluation
+    :param log_folder: Folder of all runs
+    :return: The result, None if the training was interrupted
     """
     config = load_config(algo, env_id, params=[f"belief:{belief}"], n_timesteps=n_timesteps)
-    # What a result belongs to: a changed entry is another run
+    # The file also holds the settings: with a changed YAML entry the run is trained again
     name = f"{algo}-{folder_name(env_id)}-{belief}-{config.n_timesteps}-{seed}"
     path = Path(log_folder, "learning", f"{name}.json")
     if path.is_file():
@@ -87,7 +90,7 @@ def learn(
         if record["config"] == config.to_yaml():
             return Learned(**record["learned"])
     start = time.process_time()
-    # No evaluations on the way: they would count as training time
+    # No evaluations during the training, since they would count as its time
     result = train(config, TrainOptions(seed=seed, log_folder=log_folder, eval_freq=-1, verbose=0))
     seconds = time.process_time() - start
     if not result.finished:
@@ -108,11 +111,13 @@ def _measure(config: RunConfig, team: Team, episodes: int, deterministic: bool) 
 
 def compare(beliefs: Iterable[str], seeds: Iterable[int], jobs: int, **settings: object) -> list[Learned]:
     """
-    :param beliefs: variants
-    :param seeds: of the runs of each
-    :param jobs: processes
-    :param settings: see ``learn``
-    :return: all that were finished; each is printed when it is there
+    Train several runs in processes, and print the result of each.
+
+    :param beliefs: Variants of the belief
+    :param seeds: Seeds of each variant
+    :param jobs: Number of processes
+    :param settings: Further arguments of ``learn``
+    :return: The results of all runs that were finished
     """
     pairs = [(belief, seed) for belief in beliefs for seed in seeds]
     run = partial(learn, **settings)  # type: ignore[arg-type]
