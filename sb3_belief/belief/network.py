@@ -26,11 +26,13 @@ LOG_STD_RANGE = (-5.0, 2.0)
 
 class BeliefOutput(NamedTuple):
     """
+    A belief about the others, and where it comes from.
+
     :param latent: The belief ``delta``, ``[B, z]`` (eq. 5)
     :param mean: Mean of its distribution, ``[B, z]``
     :param log_std: Log standard deviation of its distribution, ``[B, z]``; minus infinity where it is a single point
-    :param prediction: The others' predicted actions, flattened, ``[B, W]``: numbers or logits, whatever the loss makes of
-        them; None for a belief that predicts nothing
+    :param prediction: The others' predicted actions, flattened, ``[B, W]``: numbers or logits, depending on the loss that they
+        are trained with; None for a belief that predicts nothing
     :param selected: The history rows attended to, as indices into the rows filled so far, int32 ``[B, N_h]``;
         ``N_h`` is 0 while the history is empty, and for a belief without one
     :param weights: Their attention weights, ``[B, N_h]``, each row sums to one
@@ -46,9 +48,10 @@ class BeliefOutput(NamedTuple):
 
 class HistoryContext(NamedTuple):
     """
-    A history as the network sees it; constant as long as neither the history nor the weights change.
+    A history encoded by the network. It stays the same as long as neither the history nor the weights change.
 
-    :param directions: What rows are compared by, scaled to length one for the cosine similarity, ``[T, d]`` or ``[T, d_o]``
+    :param directions: Embeddings or observations of the rows, of unit length for the cosine similarity, ``[T, d]`` or ``[T,
+        d_o]``
     :param keys: Keys of the rows, ``[T, d]``, divided by the root of the width
     :param values: Values of the rows, ``[T, d]``
     """
@@ -60,9 +63,11 @@ class HistoryContext(NamedTuple):
 
 def n_selected(keep_ratio: float, n_rows: int) -> int:
     """
+    Return how many history rows are attended to.
+
     :param keep_ratio: ``p``, in (0, 1]
     :param n_rows: Number of filled history rows, at least 0
-    :return: How many of them are attended to, ``N_h`` of eq. 3: a share of ``keep_ratio``, at least one
+    :return: ``N_h`` of eq. 3: a share of ``keep_ratio``, at least one row if there is any
     """
     return min(n_rows, max(1, round(keep_ratio * n_rows)))
 
@@ -81,10 +86,9 @@ def filled_rows(history: History) -> History:
 
 class DynamicBelief(nn.Module):
     """
-    What the agent believes the others will do now, inferred from its observation and its history.
+    The network that infers what the agent believes about the others, from its observation and its history.
 
-    Every variant is this network less the parts that it does not use: those are not built, so that all weights there are
-    take part.
+    The variants of the belief lack some of its parts. These are not built, so that all weights of a network are in use.
 
     :param observation_dim: ``d_o``, width of the flattened observation
     :param action_dim: ``W``, width of the others' flattened actions
@@ -92,7 +96,8 @@ class DynamicBelief(nn.Module):
     :param latent_dim: ``z``, width of the belief
     :param keep_ratio: ``p``, the share of the history that is attended to, in (0, 1]
     :param variant: A key of :data:`~sb3_belief.belief.VARIANTS`
-    :param similarity: What history rows are compared by: ``"embedding"`` (eq. 3) or the ``"observation"`` itself (Fig. 5b)
+    :param similarity: What rows are compared with the present by: their ``"embedding"`` (eq. 3) or the ``"observation"``
+        itself (Fig. 5b)
     """
 
     def __init__(
@@ -130,21 +135,23 @@ class DynamicBelief(nn.Module):
             self.encoder = nn.Sequential(nn.Linear(embedding_dim, hidden), nn.ReLU(), nn.Linear(hidden, latent_dim))
 
     def _hidden_of_wide(self) -> int:
-        """The hidden width with which ``wide`` has as many weights as ``dynamic``, to half a hidden unit's."""
+        """Return the hidden width with which ``wide`` has as many weights as ``dynamic``, to within half a hidden unit."""
         w, d, z = self.action_dim, self.embedding_dim, self.latent_dim
         beyond_embedding = (w + 1) * d + 3 * d**2 + (d + 1) * 2 * z + (z + 1) * w
         return max(1, round((beyond_embedding - z) / (d + 1 + z)))
 
     def context_parameters(self) -> list[th.Tensor]:
         """
-        :return: All weights that the context of a history depends on
+        Return all weights on which the encoded history depends.
         """
-        # Not parameters(), which looks for submodules: this is asked once a step
+        # Not by parameters(), which searches all submodules: this is called once a step
         layers = (*self.observation_embedding, self.action_embedding, self.key, self.value)
         return [weights for layer in layers for weights in layer._parameters.values() if weights is not None]
 
     def encode_history(self, history: History) -> HistoryContext:
         """
+        Encode a history.
+
         :param history: The agent's history
         :return: Its filled rows as directions, keys and values
         """
@@ -164,16 +171,18 @@ class DynamicBelief(nn.Module):
         predict: bool = True,
     ) -> BeliefOutput:
         """
+        Infer the belief.
+
         :param observations: ``[B, d_o]``
         :param history: The agent's history; a variant that does not attend ignores it
         :param noise: Standard normal noise ``[B, z]`` for eq. 5; without it the belief is its mean. A variant that does not
             sample ignores it
-        :param selected: The rows to attend to, ``[B, N_h]``, if they have been selected before; by default those most
-            similar to each observation are selected here (eq. 3)
-        :param context: ``encode_history(history)``, if it is at hand
-        :param predict: Whether the others' actions are wanted
-        :return: The belief and all that belongs to it
-        :raises ValueError: if a variant that attends is given no history, or more rows are to be kept than it has
+        :param selected: The rows to attend to, ``[B, N_h]``, if they were selected before; None to select those most similar
+            to each observation (eq. 3)
+        :param context: ``encode_history(history)``, if it is known already; no gradients flow to the weights through it then
+        :param predict: Whether to predict the others' actions
+        :return: The belief
+        :raises ValueError: If a variant that attends is given no history, or more rows are selected than it has
         """
         embedding = self.observation_embedding(observations)
         if self.variant.attends:
@@ -195,7 +204,7 @@ class DynamicBelief(nn.Module):
         encoded = self.encoder(embedding)
         if self.variant.samples:
             mean, log_std = encoded.chunk(2, dim=-1)
-            # clamp(), whose backward pass takes four times as long
+            # The same as clamp(), whose backward pass takes four times as long
             log_std = F.hardtanh(log_std, *LOG_STD_RANGE)
             latent = mean if noise is None else mean + log_std.exp() * noise
         else:
@@ -210,23 +219,24 @@ class DynamicBelief(nn.Module):
     @th.no_grad()
     def _most_similar(self, observations: th.Tensor, embeddings: th.Tensor, context: HistoryContext) -> th.Tensor:
         """
-        Eq. 3, with the sign that its text asks for: printed, the equation keeps the *least* similar rows. The choice
-        is discrete, so no gradient flows through it.
+        Select the rows of eq. 3, with the sign that its text asks for: as printed, the equation keeps the *least* similar
+        rows. The choice is discrete, so no gradient flows through it.
         """
-        # The length of the present one changes nothing in the order, so only the rows' directions are needed
+        # The length of the present vector does not change the order, so only those of the rows are normalised
         similarity = self._compared(observations, embeddings) @ context.directions.mT
         return topk_indices(similarity, n_selected(self.keep_ratio, similarity.shape[-1]))
 
     def _attend_to_states(self, embedding: th.Tensor, rows: History, selected: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        Eq. 4 less its first term: the weighted sum of the kept rows' values, zero while the history is empty. The paper
-        names no softmax; "scaled" is read as in the transformer, by the root of the width.
+        Compute eq. 4 without its first term: the weighted sum of the selected rows' values, zero while the history is empty.
+        The paper names no softmax; "scaled" is read as in the transformer, by the root of the width.
 
-        Without keys and values of all rows, since both are linear in the states: the query goes to the states by way of the
-        keys' weights, and the mean of values is the value of the mean. In a single pass these are fewer products where B < T.
+        Keys and values of all rows are not needed, since both are linear in the states: the query is multiplied with the keys'
+        weights and then with the states, and the mean of the values is the value of the mean state. These are fewer products
+        than encoding the history where B < T.
         """
         if selected.shape[-1] == 0:
-            # No gradient either: one of zeros would count as a step of Adam's
+            # Not connected to the graph: a gradient of zeros would count as a step of Adam
             return th.zeros_like(embedding), embedding.new_zeros(selected.shape)
         states = self.observation_embedding(rows.observations) + self.action_embedding(rows.actions)
         queries = self.query(embedding) @ (self.key.weight / math.sqrt(self.embedding_dim))

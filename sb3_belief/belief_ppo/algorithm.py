@@ -1,4 +1,4 @@
-"""What makes an SB3 algorithm of PPO's kind one with a belief."""
+"""The part of BeliefPPO and MaskableBeliefPPO that they have in common."""
 
 import warnings
 from dataclasses import asdict, fields
@@ -30,11 +30,13 @@ else:
 
 class BeliefAlgorithmMixin(_Algorithm):
     """
-    What makes an SB3 PPO one with a belief: it stages each step's part of the belief, sees to it that the belief's loss
-    joins each minibatch, and renews the history after each update. No method of SB3's is copied.
+    Makes an SB3 algorithm of PPO's kind one with a belief.
+
+    It writes each step's data of the belief into the rollout buffer, hands the loss coefficients to the policy, and renews the
+    history after each update. The belief's loss joins in the policy (``evaluate_actions``). No method of SB3 is copied.
     """
 
-    #: SB3's algorithm without the belief, for messages
+    #: Name of SB3's algorithm without the belief, for messages
     stock: ClassVar[str]
     #: Base class of the policies, and the rollout buffers for plain and for Dict observations
     policy_base: ClassVar[type[BeliefPolicyMixin]]
@@ -55,7 +57,7 @@ class BeliefAlgorithmMixin(_Algorithm):
     kl_coef: float | Schedule
 
     def _setup_belief(self, options: BeliefOptions, action_coef: float | Schedule, kl_coef: float | Schedule) -> None:
-        """Store the belief's arguments; called by the constructor between SB3's and `_setup_model`."""
+        """Check and store the belief's arguments, between SB3's constructor and `_setup_model`."""
         for name, value in asdict(options).items():
             setattr(self, name, value)
         for name, coefficient in (("action_coef", action_coef), ("kl_coef", kl_coef)):
@@ -65,7 +67,7 @@ class BeliefAlgorithmMixin(_Algorithm):
                 raise ValueError(f"{name} is {coefficient!r}; the weight of a loss must be at least 0")
         self.action_coef = action_coef if callable(action_coef) else float(action_coef)
         self.kl_coef = kl_coef if callable(kl_coef) else float(kl_coef)
-        # Whoever holds no belief about the others may meet any
+        # An agent without a belief may meet any others
         self.others_action_spaces = {} if self.env is None or options.variant is None else others_of(self.env)
 
     @property
@@ -104,13 +106,13 @@ class BeliefAlgorithmMixin(_Algorithm):
         try:
             super()._setup_model()
         finally:
-            # What is saved, and compared on load, is what the user gave
+            # The user's own arguments are what is saved, and compared on load
             self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs = user_kwargs
         # As SB3 does with its own coefficients that may be schedules
         self.action_coef, self.kl_coef = FloatSchedule(self.action_coef), FloatSchedule(self.kl_coef)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "") -> None:
-        # SB3 knows the policies without convolutions by the name of their class
+        # SB3 recognises policies without convolutions by the names of their classes
         extractor = getattr(self.policy_class, "default_extractor", None) or fitting_extractor(self.observation_space)
         super()._maybe_recommend_cpu(self.policy_class.__name__ if extractor is FlattenExtractor else "")
 
@@ -143,12 +145,12 @@ class BeliefAlgorithmMixin(_Algorithm):
     # -- rollout -------------------------------------------------------------------------------------------------------
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        # SB3 calls this once a step, right before it bootstraps time limits and adds the step to the buffer
+        # SB3 calls this once a step, after the callbacks and before it bootstraps time limits and adds the step to the buffer
         super()._update_info_buffer(infos, dones)
         if dones is not None and dones.any():
             self.policy.attach_terminal_values(infos, dones)
         active = np.ones(self.n_envs, dtype=bool)
-        # SB3 takes environments that return fewer infos than copies
+        # SB3 accepts environments that return fewer infos than copies
         active[: len(infos)] = [info.get("active", True) for info in infos]
         others = read_others(infos, self.policy.layout) if self.policy.has_belief else ()
         self.rollout_buffer.stage(active, *others)
@@ -157,11 +159,13 @@ class BeliefAlgorithmMixin(_Algorithm):
 
     def train(self) -> None:
         """
-        SB3's update, in which each minibatch also trains the belief. Thereafter the history becomes the agent's own last
-        steps: this rollout's, which the next rollout and its update look back on, never the one being trained on.
+        Update as SB3 does; each minibatch also trains the belief.
+
+        Afterwards the history becomes the agent's own last steps, those of this rollout included. The next rollout and its
+        update look back on it. It never holds the rows being trained on, where attention would find their own labels.
         """
         buffer, policy = self.rollout_buffer, self.policy
-        # A single step has no advantage statistics
+        # The advantages of a single step cannot be normalised
         learns = buffer.active.sum() > 1 or (buffer.active.all() and not self.normalize_advantage)
         if not policy.has_belief or not buffer.active.any():
             if learns:
@@ -176,7 +180,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         policy.remember(observations, actions)
 
     def _coefficient(self, name: str) -> float:
-        """The weight of a loss at this time of the training."""
+        """Return and log the present value of a loss coefficient, which may be a schedule."""
         value = getattr(self, name)(self._current_progress_remaining)
         if value < 0:
             raise ValueError(
@@ -188,16 +192,18 @@ class BeliefAlgorithmMixin(_Algorithm):
 
     def _update(self) -> None:
         super().train()
-        # SB3 computes this over all steps, also those in which the agent was not in play and no value is trained
+        # SB3 computes it over all steps, including those in which the agent was not in play and no value is trained
         active, values, returns = (getattr(self.rollout_buffer, name).flatten() for name in ("active", "values", "returns"))
         self.logger.record("train/explained_variance", explained_variance(values[active], returns[active]))
 
 
 def refuse_many_agents(env: Any, algorithm: str) -> None:
     """
-    :param env: What a user gave as the environment of one agent
-    :param algorithm: Name of the algorithm it was given to
-    :raises TypeError: if it is an environment of many agents
+    Refuse an environment of many agents for an algorithm that trains one.
+
+    :param env: What the user gave
+    :param algorithm: Name of the algorithm
+    :raises TypeError: If it is an environment of many agents
     """
     is_pettingzoo = isinstance(env, (ParallelEnv, AECEnv))
     if is_pettingzoo or (isinstance(env, VecEnv) and hasattr(env, "possible_agents")):

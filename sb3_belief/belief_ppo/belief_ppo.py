@@ -23,12 +23,12 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     """
     Belief PPO (*Dynamic Belief for Decentralized Multi-Agent Cooperative Learning*, IJCAI 2023).
 
-    PPO for one agent among others: policy and value are conditioned on a belief about what the others will do, inferred from
-    the agent's own history and trained by predicting the actions of those it sees. It takes all of PPO's arguments, and of
-    the environment only `others_action_spaces` and, in `info`, `others_actions` and `others_visible`, as a
-    :class:`~sb3_belief.team.Team` provides them. Without others it is PPO.
+    PPO for one agent among others. Policy and value are conditioned on a belief about what the others will do, which is
+    inferred from the agent's own history and trained by predicting the actions of the others that it sees. It takes all of
+    PPO's arguments. Of the environment it needs the attribute ``others_action_spaces`` and, in ``info``, ``others_actions``
+    and ``others_visible``, as a :class:`~sb3_belief.team.Team` provides them. Without others it is PPO.
 
-    Two more keys of `info` matter: steps with ``active=False`` are left out of loss, advantage statistics and history.
+    Steps with ``active=False`` in ``info`` are left out of loss, advantage statistics and history.
 
     :param policy: ``"BeliefPolicy"``, whose features extractor fits the observation space, one of SB3's names ``"MlpPolicy"``,
         ``"CnnPolicy"``, ``"MultiInputPolicy"``, or a class derived from :class:`~sb3_belief.BeliefActorCriticPolicy`
@@ -73,8 +73,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param similarity: What past steps are compared with the present by: the ``"embedding"`` (eq. 3) or the ``"observation"``
         itself (Fig. 5b)
     :param detach_belief: Whether to keep the gradient of policy and value out of the belief network
-    :raises TypeError: for an environment of many agents, with the ways to train on it
-    :raises ValueError: for an argument without meaning, with what is allowed
+    :raises TypeError: For an environment of many agents, with the ways to train on it
+    :raises ValueError: For an argument that makes no sense, with what is allowed
     """
 
     stock = "PPO"
@@ -168,5 +168,5 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> "BeliefPPO":
-        """As PPO's ``learn``."""
+        """Learn as PPO does. The arguments are those of PPO's ``learn``."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

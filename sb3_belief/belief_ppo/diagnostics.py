@@ -13,15 +13,17 @@ from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch, at
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
-# Enough for two digits, and a small part of an update's time
+# Enough for two significant digits, at a small part of an update's time
 PROBE_ROWS = 256
 
 
 @th.no_grad()
 def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict[str, float]:
     """
+    Measure the belief on steps that it has not been trained on yet.
+
     :param policy: A policy with a belief
-    :param buffer: Its rollout, complete, before the update that trains on it
+    :param buffer: Its complete rollout, before the update that trains on it
     :return: By name, over up to 256 active steps spread evenly over the rollout:
         ``action_loss`` (eq. 7, or the cross-entropy in its place) and ``kl``, as they enter eq. 8 before their weights;
         ``accuracy`` of the most likely action of each visible other, and ``base_rate``, that of always naming each other's
@@ -32,7 +34,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
         ``visible_fraction``, share of the others that are visible;
         ``first_log_ratio``, largest |log ratio| of the policies that acted and that is trained: 0 but for rounding.
-        What a belief does not have (a prediction, a latent that is sampled, rows attended to) is left out
+        Measures of parts that a belief does not have (a prediction, a sampled latent, attention) are left out
     """
     rows = np.flatnonzero(buffer.active)
     rows = rows[np.linspace(0, len(rows) - 1, min(PROBE_ROWS, len(rows))).astype(int)]
@@ -71,7 +73,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
 
 
 def _shuffled(actions: th.Tensor, valid: th.Tensor) -> th.Tensor:
-    """The valid rows in an arbitrary but fixed order: drawing one would shift the stream that the update draws from."""
+    """Return the valid rows in an arbitrary but fixed order. Drawing one would advance the generator of the update."""
     rows = valid.nonzero().flatten()
     order = th.as_tensor(np.random.default_rng(0).permutation(len(rows)), device=actions.device)
     result = actions.clone()
@@ -98,7 +100,7 @@ def _first_log_ratio(
 
 
 def _accuracies(prediction: th.Tensor, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:
-    """Accuracy and base rate over all visible discrete actions; not a number where there are none."""
+    """Return accuracy and base rate over all visible discrete actions; NaN where there are none."""
     right = most_frequent = total = 0
     for owner, start, width in layout.blocks:
         visible = minibatch.others_visible[:, owner]

@@ -18,14 +18,14 @@ from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
 
 class MaskableBeliefRolloutBuffer(BeliefBufferMixin, MaskableRolloutBuffer):
-    """sb3-contrib's rollout buffer with the belief's part of each step, see :class:`BeliefBufferMixin`."""
+    """sb3-contrib's rollout buffer with the belief's data of each step, see :class:`BeliefBufferMixin`."""
 
 
 class MaskableBeliefDictRolloutBuffer(BeliefBufferMixin, MaskableDictRolloutBuffer):
-    """The same for Dict observations."""
+    """sb3-contrib's rollout buffer for Dict observations with the belief's data of each step."""
 
 
-# To a type checker the mixins stand on SB3's own classes, from which sb3-contrib's differ in these attributes
+# For a type checker the mixins derive from SB3's own classes, from which sb3-contrib's differ in some attributes
 class MaskableBeliefActorCriticPolicy(BeliefPolicyMixin, MaskableActorCriticPolicy):  # type: ignore[misc]
     """
     sb3-contrib's ``MaskableActorCriticPolicy`` with a belief; takes all of its arguments and those of
@@ -34,28 +34,30 @@ class MaskableBeliefActorCriticPolicy(BeliefPolicyMixin, MaskableActorCriticPoli
 
 
 class MaskableBeliefMlpPolicy(MaskableBeliefActorCriticPolicy):
-    """The same for vectors; images are flattened."""
+    """A masked policy with a belief for vectors; images are flattened."""
 
     default_extractor = FlattenExtractor
 
 
 class MaskableBeliefCnnPolicy(MaskableBeliefActorCriticPolicy):
-    """The same for images."""
+    """A masked policy with a belief for images."""
 
     default_extractor = NatureCNN
 
 
 class MaskableBeliefMultiInputPolicy(MaskableBeliefActorCriticPolicy):
-    """The same for Dicts."""
+    """A masked policy with a belief for Dict observations."""
 
     default_extractor = CombinedExtractor
 
 
 class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc]
     """
-    Belief PPO with invalid action masking: :class:`~sb3_belief.BeliefPPO` on sb3-contrib's ``MaskablePPO``, all of whose
-    arguments it takes. The masks are those of the environment's ``action_masks()``, in a Team those that its environment puts
-    into ``infos[agent]["action_mask"]``; they hold in rollout and update alike. Box actions cannot be masked.
+    Belief PPO with invalid action masking.
+
+    This is :class:`~sb3_belief.BeliefPPO` on sb3-contrib's ``MaskablePPO``, all of whose arguments it takes. The masks come
+    from the environment's ``action_masks()``; in a Team these are the masks that its environment puts into
+    ``infos[agent]["action_mask"]``. They hold in rollout and update alike. Box actions cannot be masked.
 
     :param policy: ``"BeliefPolicy"``, whose features extractor fits the observation space, one of SB3's names ``"MlpPolicy"``,
         ``"CnnPolicy"``, ``"MultiInputPolicy"``, or a class derived from :class:`MaskableBeliefActorCriticPolicy`
@@ -92,8 +94,8 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param policy_latent: As in BeliefPPO
     :param similarity: As in BeliefPPO
     :param detach_belief: As in BeliefPPO
-    :raises TypeError: for an environment of many agents, with the ways to train on it
-    :raises ValueError: for an argument without meaning, with what is allowed
+    :raises TypeError: For an environment of many agents, with the ways to train on it
+    :raises ValueError: For an argument that makes no sense, with what is allowed
     """
 
     stock = "MaskablePPO"
@@ -184,7 +186,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         use_masking: bool = True,
         progress_bar: bool = False,
     ) -> "MaskableBeliefPPO":
-        """As MaskablePPO's ``learn``."""
+        """Learn as MaskablePPO does. The arguments are those of MaskablePPO's ``learn``."""
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, use_masking, progress_bar
         )

@@ -1,4 +1,4 @@
-"""What a user may say about a belief, and what makes no sense."""
+"""The options of a belief, and checks of what makes no sense."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class BeliefOptions:
     """
     The belief's arguments, as :class:`~sb3_belief.BeliefPPO` explains them.
 
-    :raises ValueError: for what has no meaning; the message says what is allowed
+    :raises ValueError: For a value that makes no sense; the message says what is allowed
     """
 
     belief: str = "dynamic"
@@ -53,14 +53,16 @@ class BeliefOptions:
 
     @property
     def variant(self) -> Variant | None:
-        """The parts of the belief; None without one."""
+        """The parts that the belief has; None without a belief."""
         return VARIANTS.get(self.belief)
 
     def check_others(self, names: Collection[str], layout: ActionLayout) -> None:
         """
-        :param names: The others, in their order
-        :param layout: How their actions are coded
-        :raises ValueError: where the loss cannot be computed for the actions of one of them
+        Check that the action loss can be computed for all others.
+
+        :param names: Names of the others, in their order
+        :param layout: Layout of their actions
+        :raises ValueError: If it cannot be computed for the actions of one of them
         """
         if self.action_loss == "cross_entropy" and self.variant is not None and self.variant.predicts:
             numbers = [name for name, kind in zip(names, layout.kinds, strict=True) if kind == "number"]

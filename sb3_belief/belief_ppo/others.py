@@ -1,4 +1,4 @@
-"""What a model knows of the others: how their actions are flattened into one vector, and how to read them from `info`."""
+"""What a model knows of the others: their action spaces, and where their actions stand in one vector."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -8,15 +8,16 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import ActionLayout
+from sb3_belief.common.action_encoding import action_encoding
 
 ActionSpaces = dict[str, spaces.Space]
 
 
 class OthersPrediction(NamedTuple):
     """
-    What an agent believes, to be looked at; arrays without the batch dimension for a single observation.
+    What an agent believes, for inspection. The arrays have no batch dimension for a single observation.
 
-    :param actions: For each other what it is expected to do, ``[B, width of its action]``: the probability of each action
+    :param actions: The expected action of each other, ``[B, width of its action]``: the probability of each action
         (Discrete), of each value dimension after dimension (MultiDiscrete), of a one (MultiBinary), or the mean (Box)
     :param mean: Mean of the belief, ``[B, z]``
     :param std: Its standard deviation, ``[B, z]``; 0 where the belief is a single point
@@ -33,34 +34,22 @@ class OthersPrediction(NamedTuple):
 
 def action_layout(others_action_spaces: Mapping[str, spaces.Space]) -> ActionLayout:
     """
-    :param others_action_spaces: The others' action spaces, in the fixed order of the others
-    :return: Where each of them stands in the flattened vector: one-hot for Discrete, a one-hot a dimension for
-        MultiDiscrete, the numbers themselves for Box and MultiBinary
+    Return the layout of the others' actions in one vector.
+
+    :param others_action_spaces: The others' action spaces, in their fixed order
+    :return: Where each of them stands, encoded as in :func:`~sb3_belief.common.action_encoding.action_encoding`
+    :raises ValueError: If a space is of another kind
     """
-    widths: list[list[int]] = []
-    kinds: list[str] = []
-    for name, space in others_action_spaces.items():
-        if isinstance(space, spaces.Discrete):
-            widths.append([int(space.n)])
-            kinds.append("categorical")
-        elif isinstance(space, spaces.MultiDiscrete):
-            widths.append([int(n) for n in space.nvec.flatten()])
-            kinds.append("categorical")
-        elif isinstance(space, (spaces.Box, spaces.MultiBinary)):
-            widths.append([spaces.flatdim(space)])
-            kinds.append("number" if isinstance(space, spaces.Box) else "binary")
-        else:
-            raise ValueError(
-                f"{name} has the action space {space}; a belief can be held about Discrete, MultiDiscrete, MultiBinary "
-                "and Box actions. Flatten its action space in the environment."
-            )
-    return ActionLayout(widths, kinds)
+    encodings = [action_encoding(name, space) for name, space in others_action_spaces.items()]
+    return ActionLayout([encoding.widths for encoding in encodings], [encoding.kind for encoding in encodings])
 
 
 def others_of(env: VecEnv) -> ActionSpaces:
     """
+    Return the action spaces of the others that an environment names.
+
     :param env: The vectorised environment of one agent
-    :return: The others' action spaces in order, empty for an environment without others
+    :return: The spaces by name, in order; empty for an environment without others
     """
-    # Asked first, because a worker process does not survive being asked for what it does not have
+    # Asked first, because a worker process does not survive being asked for an attribute that it does not have
     return dict(env.get_attr("others_action_spaces")[0]) if env.has_attr("others_action_spaces") else {}

@@ -15,6 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_belief.common.action_encoding import action_encoding
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 AgentStep = tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]
@@ -205,8 +206,10 @@ class TransitionSplitter:
         n_agents = len(self._agents)
         self._n_others = n_agents - 1 + len(self._scripted)
         # All actions lie in one row of W_all columns, encoded as by gymnasium.spaces.flatten; column c belongs to owner[c]
+        names = [*self._agents, *self._scripted]
         all_spaces = [action_spaces[agent] for agent in self._agents] + list(scripted_action_spaces.values())
-        widths = [int(spaces.flatdim(space)) for space in all_spaces]
+        encodings = [action_encoding(name, space) for name, space in zip(names, all_spaces, strict=True)]
+        widths = [encoding.width for encoding in encodings]
         starts = np.concatenate([[0], np.cumsum(widths)])
         self._width = int(starts[-1])
         self._scripted_columns = slice(int(starts[n_agents]), self._width)
@@ -214,13 +217,12 @@ class TransitionSplitter:
         self._numbers: dict[str, slice] = {}
         self._discrete: list[str] = []
         offsets: list[np.ndarray] = []
-        for agent, (start, stop) in zip(self._agents, pairwise(starts[: n_agents + 1]), strict=True):
-            sizes = _component_sizes(action_spaces[agent])
-            if sizes is None:
-                self._numbers[agent] = slice(start, stop)
-            else:
+        for agent, encoding, (start, stop) in zip(self._agents, encodings, pairwise(starts), strict=False):
+            if encoding.kind == "categorical":
                 self._discrete.append(agent)
-                offsets.append(start + np.concatenate([[0], np.cumsum(sizes)[:-1]]))
+                offsets.append(start + np.concatenate([[0], np.cumsum(encoding.widths)[:-1]]))
+            else:
+                self._numbers[agent] = slice(start, stop)
         # The first column of the one-hot code of each discrete component
         self._offsets = np.concatenate(offsets).astype(int) if offsets else np.zeros(0, dtype=int)
         # Of these columns agent i gets those of the others: (viewer, column) pairs, agent after agent
@@ -315,12 +317,3 @@ class TransitionSplitter:
         seen = visible.reshape(n_envs, -1).take(self._seen, axis=1)
         # Not a product: the NaN of an invisible action must not come through
         return np.where(seen, flat.take(self._sources, axis=1), np.float32(0.0))
-
-
-def _component_sizes(space: spaces.Space) -> np.ndarray | None:
-    """Return the number of values of each discrete component of an action; None for actions that are numbers as they are."""
-    if isinstance(space, spaces.Discrete):
-        return np.array([space.n])
-    if isinstance(space, spaces.MultiDiscrete):
-        return space.nvec.ravel()
-    return None
