@@ -26,7 +26,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
 def test_the_file_says_all_that_others_read(written):
     assert written.keys() == {"ratios", "peak_mib", "versions", "details"}
     assert written["ratios"].keys() == BARS.keys()
-    # these two are measured in parts that were not asked for, or not everywhere
+    # These two are measured in parts that were not selected, or not on every machine
     unmeasured = {"workers_vs_ideal", "two_cores_vs_one"}
     assert all(value > 0 for key, value in written["ratios"].items() if key not in unmeasured)
     assert written["versions"]["torch"]
@@ -74,7 +74,7 @@ def test_loops_take_turns_and_their_ratio_is_that_of_the_same_round():
     samples = alternate({"a": lambda: loop("a", 2), "b": lambda: loop("b", 3)}, rounds=3, warmup=1)
     assert order == ["a", "b", "a", "b", "b", "a", "a", "b"]
     assert [sample.steps for sample in samples["b"]] == [3, 3, 3]
-    # the machine was half as fast in the second round, for both
+    # In the second round the machine was half as fast, for both loops
     fast, slow = [Sample(100, 1.0, 2.0), Sample(100, 2.0, 4.0)], [Sample(100, 2.0, 2.0), Sample(100, 4.0, 4.0)]
     assert ratio(fast, slow) == (2.0, 2.0, 2.0)
     assert ratio(fast, slow, "wall") == (1.0, 1.0, 1.0)
@@ -89,13 +89,13 @@ def test_the_phases_of_a_loop_are_all_of_its_time(rollouts):
     (phases,) = loop.phases
     assert phases.keys() == set(PHASES)
     assert all(sample.steps == measured.steps and sample.cpu > 0 and sample.wall > 0 for sample in phases.values())
-    # apart from what the two clocks themselves take
+    # The two clocks are read one after the other, hence the tolerance
     for clock in ("cpu", "wall"):
         parts = sum(getattr(sample, clock) for sample in phases.values())
         assert parts == pytest.approx(getattr(measured, clock), rel=0.05, abs=0.005)
 
 
-def test_a_phase_is_what_lies_between_the_marks_of_its_kind():
+def test_time_is_added_to_the_phase_in_which_it_passes():
     team = spread_team("ippo", quick=True)
     env: Any = team.get_env()
     models: list[Any] = list(team.agents.values())
@@ -161,7 +161,7 @@ def test_all_ways_of_attention_give_the_same():
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_it_is_said_that_there_is_none():
+def test_without_a_gpu_the_report_says_that_there_is_none():
     report = Report(rounds=1, quick=True)
     gpu.run(report)
     assert "no GPU" in report.skipped["gpu"] and "gpu_vs_cpu_update" not in report.ratio_rows
@@ -194,5 +194,5 @@ def test_memory_and_workers_are_measured(tmp_path):
     assert written["ratios"]["workers_vs_ideal"] > 0
     steps = {row["name"]: row["steps"] for row in written["details"]["rows"]}
     assert steps["burns, stepped"] == steps["sleeps, learning"] == steps["sleeps, bare"] == [2 * 4]
-    # Nobody takes less time than it takes
+    # No process can be faster than the ideal
     assert written["details"]["ratios"]["workers_sleeps_bare"]["median"] < 1

@@ -1,4 +1,4 @@
-"""Programs in processes of their own are compared, with tiny ones in place of the libraries."""
+"""Programs in processes of their own are compared, with tiny programs in place of the libraries."""
 
 import json
 import sys
@@ -9,7 +9,7 @@ import pytest
 from benchmarks.peers import __main__ as peers
 from benchmarks.peers.programs import Program
 
-# Says its name to a file at each iteration, so that their order is seen
+# Writes its name to a file at each iteration, which shows the order of the iterations
 CHILD = """
 import json, sys, time
 name, order, dies_after = sys.argv[1], sys.argv[2], int(sys.argv[3])
@@ -48,7 +48,7 @@ def test_programs_take_turns_and_one_that_dies_is_skipped(make, tmp_path, capsys
     report.write(out)
 
     order = (tmp_path / "order").read_text().split()
-    # each is warmed up first; then back and forth, without who has died
+    # Each is warmed up first; then they take turns back and forth, without those that have died
     assert order[:5] == ["ippo", "rival", "dies", "never", "env"]
     assert order[5:] == ["ippo", "rival", "dies", "env", "env", "dies", "rival", "ippo", "ippo", "rival", "env"]
     written = json.loads(out.read_text())
@@ -68,7 +68,7 @@ def test_programs_take_turns_and_one_that_dies_is_skipped(make, tmp_path, capsys
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="CPU time of other processes comes from /proc")
-def test_what_a_turn_takes_is_that_of_the_process_and_of_those_that_it_started(tmp_path):
+def test_the_time_of_a_turn_includes_the_processes_that_the_program_started(tmp_path):
     burns = "import time\nend = time.process_time() + 0.2\nwhile time.process_time() < end: pass"
     child = f"""
 import subprocess, sys
@@ -88,10 +88,10 @@ while sys.stdin.readline():
     assert program.samples[0].wall >= 0.19
 
 
-def test_one_that_does_not_answer_is_ended():
+def test_a_program_that_does_not_answer_is_ended():
     program = Program("hangs", [sys.executable, "-c", "import time; time.sleep(60)"], seconds=0.2)
     program.start()
-    assert program.error == "no answer in time: it ended without a word"
+    assert program.error == "no answer in time: it ended without a message"
     assert program.turn() == 0 and program.samples == []
     program.stop()
 

@@ -1,7 +1,8 @@
 """
-Is the belief dynamic? Games whose optimum is known (docs/algorithm.md), with the settings of zoo_configs/belief_ppo.yml.
+Is the belief dynamic? Games with a known optimum (docs/algorithm.md), with the settings of zoo_configs/belief_ppo.yml.
 
-The bars are those of the method's claims, not of a curve that was seen: 1/m without a history, close to the optimum with one.
+The thresholds come from the claims of the method, not from a measured curve: success is 1/m without a history, and close to
+the optimum with one.
 """
 
 import os
@@ -18,7 +19,7 @@ Results = Callable[[str, str], list[Played]]
 
 
 def test_a_belief_follows_a_leader_whom_no_weights_can_know():
-    """The small game that guards every change: 60 of the 100 rollouts, in which each convention lives for five."""
+    """A short run for every change: 60 of the 100 rollouts of a game in which each convention lasts for five."""
     dynamic, none = play("redraw", "dynamic", 0, rollouts=60), play("redraw", "none", 0, rollouts=60)
     settled = np.arange(60) % 5 > 0
     assert dynamic.curve[40:][settled[40:]].mean() > 0.9
@@ -29,7 +30,7 @@ def test_a_belief_follows_a_leader_whom_no_weights_can_know():
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    """The games that the tests below look at, two at a time where there are two cores."""
+    """Play the games that the tests below need, in as many processes as there are cores, and remember the results."""
     played: dict[tuple[str, str], list[Played]] = {}
 
     def get(game: str, belief: str) -> list[Played]:
@@ -41,7 +42,7 @@ def results() -> Results:
     return get
 
 
-# Which variants play a game, and for how many rollouts: fewer than in the YAML entry where there is nothing to be learned
+# The variants that play each game, and for how many rollouts: None for those of the YAML entry, fewer where nothing can be learned
 PLAYED: dict[str, list[tuple[tuple[str, ...], int | None]]] = {
     "swap": [(HISTORY, None), (tuple(belief for belief in BELIEFS if belief not in HISTORY), 25)],
     "watch-act": [(("dynamic", "none"), None)],
@@ -77,7 +78,7 @@ def test_watch_then_act(results):
 @pytest.mark.slow
 def test_redraw_is_close_to_the_optimum(results):
     assert all(result.success >= 0.75 for result in results("redraw", "dynamic"))
-    # Luck in the first rollouts of 25 conventions is all that may lift it above the optimum
+    # Only luck in the first rollouts of 25 conventions may lift it above the optimum
     assert mean(results("redraw", "dynamic")) <= GAMES["redraw"].best + 0.03
 
 
