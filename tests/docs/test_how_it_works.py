@@ -77,7 +77,7 @@ def minibatch() -> Entered:
     model.learn(42)
     get = model.rollout_buffer.get
 
-    def watched(batch_size: int) -> Generator[Any, None, None]:
+    def watched(batch_size: int | None = None) -> Generator[Any, None, None]:
         minibatches = get(batch_size)
         yield next(minibatches)
         # From when SB3 asks for the second one to when it asks for the third
