@@ -133,15 +133,15 @@ def test_ctrl_c_while_workers_step(tmp_path):
     """The results under way do not come back as those of a later step."""
     env = make_team_env(ToyEnv, n_envs=2, vec_env="subproc")
     team = make_team(env)
-    await_workers, calls = env._await_workers, []
+    await_steps, calls = env.venv._await_steps, []
 
-    def interrupted(venv):
+    def interrupted():
         calls.append(1)
         if len(calls) == 6:
             os.kill(os.getpid(), signal.SIGINT)
-        await_workers(venv)
+        await_steps()
 
-    env._await_workers = interrupted
+    env.venv._await_steps = interrupted
     with pytest.raises(KeyboardInterrupt):
         team.learn(64)
     # an interruption means new episodes, even where the counts go on
