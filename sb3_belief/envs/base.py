@@ -1,13 +1,19 @@
 """Base classes and checks that the PettingZoo environments and adapters of this package share."""
 
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
+import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 Obs = TypeVar("Obs")
 Act = TypeVar("Act")
+Infos: TypeAlias = dict[str, dict[str, Any]]
+# Observations and infos by agent, as PettingZoo's reset() returns them
+ResetResult: TypeAlias = tuple[dict[str, np.ndarray], Infos]
+# Observations, rewards, terminations, truncations and infos by agent, as PettingZoo's step() returns them
+StepResult: TypeAlias = tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], Infos]
 
 
 class TeamGame(ParallelEnv[str, Obs, Act], Generic[Obs, Act]):

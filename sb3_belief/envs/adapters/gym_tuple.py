@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_belief.envs.base import TeamGame
+from sb3_belief.envs.base import ResetResult, TeamGame
 from sb3_belief.envs.suites import nearest
 
 _SEQUENCES = (list, tuple, np.ndarray)
@@ -122,9 +122,7 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
 
     # PettingZoo's interface
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start an episode.
 
@@ -287,6 +285,18 @@ class ResumableTupleEnv(GymTupleEnv):
         self._steps, self._saw = state["steps"], state["saw"]
         self._in_play = self._active()
         self.agents = self.possible_agents[:] if state["under_way"] else []
+
+
+class DrawnTupleEnv(ResumableTupleEnv):
+    """``ResumableTupleEnv`` whose game draws itself, and ignores the render mode with which it was made."""
+
+    def render(self) -> Any:
+        """
+        Return an image, or show the game in a window.
+
+        :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
+        """
+        return self.game.render(mode=self.render_mode or "human")
 
 
 def make_registered(package: str, id: str, known: Sequence[str], **env_kwargs: Any) -> gym.Env:

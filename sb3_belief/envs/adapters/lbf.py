@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from sb3_belief.envs.adapters.gym_tuple import ResumableTupleEnv, make_registered
+from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
 
 
-class Foraging(ResumableTupleEnv):
+class Foraging(DrawnTupleEnv):
     """
     Level-Based Foraging: players on a grid collect food. See ``docs/environments/lbf.md``.
 
@@ -69,15 +69,6 @@ class Foraging(ResumableTupleEnv):
         :return: Their sum, which is the fraction of all food levels that was collected in this step
         """
         return sum(rewards.values())
-
-    def render(self) -> Any:
-        """
-        Return an image, or show the field in a window.
-
-        :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
-        """
-        # The package's render() ignores its own render_mode
-        return self.game.render(mode=self.render_mode or "human")
 
 
 def make(name: str, **env_kwargs: Any) -> Foraging:

@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from sb3_belief.envs.adapters.gym_tuple import ResumableTupleEnv, make_registered
+from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
 
 
-class Warehouse(ResumableTupleEnv):
+class Warehouse(DrawnTupleEnv):
     """
     Multi-Robot Warehouse: robots carry requested shelves to the goals and return them. See ``docs/environments/rware.md``.
 
@@ -51,15 +51,6 @@ class Warehouse(ResumableTupleEnv):
         """
         total = sum(rewards.values())
         return total / len(rewards) if self.game.reward_type.name == "GLOBAL" else total
-
-    def render(self) -> Any:
-        """
-        Return an image, or show the warehouse in a window.
-
-        :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
-        """
-        # The package's render() ignores its own render_mode
-        return self.game.render(mode=self.render_mode or "human")
 
 
 def make(name: str, **env_kwargs: Any) -> Warehouse:

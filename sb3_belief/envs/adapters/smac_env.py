@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_belief.envs.base import BattleGame, check_render_mode, require_render_mode
+from sb3_belief.envs.base import BattleGame, ResetResult, StepResult, check_render_mode, require_render_mode
 
 RENDER_MODES = ("human", "rgb_array")
 NO_OP = 0
@@ -65,9 +65,7 @@ class StarCraft(BattleGame[np.ndarray]):
         self._masks = np.ones((n_agents, self.n_actions), dtype=bool)
         self._visible = np.zeros((n_agents, n_agents - 1), dtype=bool)
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start a battle.
 
@@ -113,9 +111,7 @@ class StarCraft(BattleGame[np.ndarray]):
                     return self.game.get_obs() if answer is None else answer[0]
         raise RuntimeError(f"StarCraft II lost its connection at the beginning of {ATTEMPTS} battles of {self.name} in a row.")
 
-    def step(
-        self, actions: dict[str, int]
-    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, int]) -> StepResult:
         """
         Advance the battle by one step.
 

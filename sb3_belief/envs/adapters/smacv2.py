@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.envs.adapters.smac_env import StarCraft, starcraft_kwargs
+from sb3_belief.envs.base import ResetResult, StepResult
 
 # Arguments that all published configurations of the package share
 _PUBLISHED: dict[str, Any] = {"obs_own_pos": True, "use_unit_ranges": True, "min_attack_range": 2}
@@ -39,9 +40,7 @@ class StarCraftV2(StarCraft):
     ``attack`` capability, which no published scenario has, are not seeded.
     """
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start a battle, as the base class does.
 
@@ -56,9 +55,7 @@ class StarCraftV2(StarCraft):
         with self._own_generators():
             return super().reset(seed, options)
 
-    def step(
-        self, actions: dict[str, int]
-    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, int]) -> StepResult:
         """Advance the battle by one step, as the base class does."""
         with self._own_generators():
             return super().step(actions)

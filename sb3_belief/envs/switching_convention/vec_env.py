@@ -1,18 +1,18 @@
 """Many copies of the switching convention that are stepped at once."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_belief.envs.batched_vec_env import BatchedVecEnv
 from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
 from sb3_belief.envs.switching_convention.parallel_env import FOLLOWER, LEADER
-from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 
-class SwitchingConventionVecEnv(TeamVecEnv):
+class SwitchingConventionVecEnv(BatchedVecEnv):
     """
     Vectorised environment of ``num_envs`` copies of :class:`SwitchingConvention` in one numpy game, all with the same leader.
 
@@ -56,13 +56,6 @@ class SwitchingConventionVecEnv(TeamVecEnv):
             return [self.game.conventions[copy].copy() for copy in self._get_indices(indices)]
         return super().get_attr(attr_name, indices)
 
-    def _reset_joint(self) -> TeamObs:
-        for copy, seed in enumerate(self._seeds):
-            if seed is not None:
-                self.game.seed(copy, seed)
-        self.game.reset()
-        return {FOLLOWER: self.game.cue}
-
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         chosen = actions[FOLLOWER]
         if chosen.dtype.kind not in "iu" or chosen.min() < 0 or chosen.max() >= self.config.m:
@@ -83,25 +76,10 @@ class SwitchingConventionVecEnv(TeamVecEnv):
         # The follower is the only agent, so its reward is also the team's. A copy, so that the infos have arrays of their own
         return {FOLLOWER: cues}, rewards.copy(), dones, infos
 
-    def get_state(self) -> list[dict[str, Any]]:
-        """
-        Return everything that determines the following steps of each copy.
+    @property
+    def batched_game(self) -> ConventionGame:
+        """The game that holds all copies."""
+        return self.game
 
-        :return: One state for each copy
-        """
-        return [self.game.get_state(copy) for copy in range(self.num_envs)]
-
-    def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
-        """
-        Restore the states of all copies. The monitored returns and lengths of the running episodes start from zero.
-
-        :param states: States that ``get_state`` returned for as many copies with the same arguments
-        :return: The current cues, {agent: int64 [num_envs]}
-        :raises ValueError: If the number of copies or the arguments differ
-        """
-        if len(states) != self.num_envs:
-            raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")
-        for copy, state in enumerate(states):
-            self.game.set_state(copy, state)
-        self._zero_episode_sums()
+    def _observe(self) -> TeamObs:
         return {FOLLOWER: self.game.cue}

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_belief.envs.base import TeamGame, check_render_mode, require_render_mode
+from sb3_belief.envs.base import ResetResult, StepResult, TeamGame, check_render_mode, require_render_mode
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
@@ -103,9 +103,7 @@ class TrafficJunction(TeamGame[np.ndarray, int]):
         self._sees_now = np.zeros((1, n_cars, n_cars), dtype=bool)
         self._saw = np.zeros((1, n_cars, n_cars), dtype=bool)
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start an episode on an empty road.
 
@@ -124,9 +122,7 @@ class TrafficJunction(TeamGame[np.ndarray, int]):
             self.render()
         return obs, {agent: {"action_mask": masks[i]} for i, agent in enumerate(self.possible_agents)}
 
-    def step(
-        self, actions: dict[str, int]
-    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, int]) -> StepResult:
         """
         Advance the episode by one step.
 

@@ -1,12 +1,12 @@
 """Many copies of the Traffic Junction that are stepped at once."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_belief.envs.base import check_render_mode, require_render_mode
+from sb3_belief.envs.batched_vec_env import BatchedVecEnv
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, Step, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
@@ -17,10 +17,10 @@ from sb3_belief.envs.traffic_junction.parallel_env import (
     agent_names,
 )
 from sb3_belief.envs.traffic_junction.rendering import Renderer
-from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 
-class TrafficJunctionVecEnv(TeamVecEnv):
+class TrafficJunctionVecEnv(BatchedVecEnv):
     """
     Vectorised environment of ``num_envs`` copies of :class:`TrafficJunction` in one numpy core.
 
@@ -53,11 +53,7 @@ class TrafficJunctionVecEnv(TeamVecEnv):
         self._no_life_end = np.zeros((num_envs, len(agents)), dtype=bool)
 
     def _reset_joint(self) -> TeamObs:
-        for copy, seed in enumerate(self._seeds):
-            if seed is not None:
-                self.core.seed(copy, seed)
-        self.core.reset()
-        obs = self._observe()
+        obs = super()._reset_joint()
         self._show()
         return obs
 
@@ -111,28 +107,10 @@ class TrafficJunctionVecEnv(TeamVecEnv):
         """
         self.core.set_arrival_rate(arrival_rate)
 
-    def get_state(self) -> list[dict[str, Any]]:
-        """
-        Return everything that determines the following steps of each copy.
-
-        :return: One state for each copy
-        """
-        return [self.core.get_state(copy) for copy in range(self.num_envs)]
-
-    def set_state(self, states: Sequence[dict[str, Any]]) -> TeamObs:
-        """
-        Restore the states of all copies. The monitored returns and lengths of the running episodes start from zero.
-
-        :param states: States that ``get_state`` returned for as many copies of the same level
-        :return: The current observations, {agent: array [num_envs, width]}
-        :raises ValueError: If the number of copies or the level differs
-        """
-        if len(states) != self.num_envs:
-            raise ValueError(f"Got the states of {len(states)} copies for {self.num_envs}.")
-        for copy, state in enumerate(states):
-            self.core.set_state(copy, state)
-        self._zero_episode_sums()
-        return self._observe()
+    @property
+    def batched_game(self) -> TrafficCore:
+        """The core that holds all copies."""
+        return self.core
 
     def get_images(self) -> list[np.ndarray | None]:
         """

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from sb3_belief.envs.adapters.smax.core import Battles
 from sb3_belief.envs.adapters.smax.program import BattleConfig
 from sb3_belief.envs.adapters.smax.rendering import draw
-from sb3_belief.envs.base import BattleGame, check_render_mode, require_render_mode
+from sb3_belief.envs.base import BattleGame, ResetResult, StepResult, check_render_mode, require_render_mode
 
 RENDER_MODES = ("rgb_array",)
 
@@ -57,9 +57,7 @@ class Smax(BattleGame[np.ndarray]):
         }
         self._visible = np.zeros((len(self.possible_agents), len(self.possible_agents) - 1), dtype=bool)
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start a battle.
 
@@ -75,9 +73,7 @@ class Smax(BattleGame[np.ndarray]):
         masks = self.battles.masks[:, 0]
         return self._observe(), {agent: {"action_mask": masks[i]} for i, agent in enumerate(self.possible_agents)}
 
-    def step(
-        self, actions: dict[str, int]
-    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, int]) -> StepResult:
         """
         Advance the battle by one step.
 
