@@ -42,7 +42,7 @@ def results() -> Results:
     return get
 
 
-# The variants that play each game, and for how many rollouts: None for those of the YAML entry, fewer where nothing can be learned
+# The variants that play each game, and for how many rollouts: None for the YAML entry, fewer where nothing can be learned
 PLAYED: dict[str, list[tuple[tuple[str, ...], int | None]]] = {
     "swap": [(HISTORY, None), (tuple(belief for belief in BELIEFS if belief not in HISTORY), 25)],
     "watch-act": [(("dynamic", "none"), None)],
