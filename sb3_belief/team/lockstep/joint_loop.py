@@ -32,8 +32,6 @@ from sb3_belief.team.lockstep.scheduler import (
     COUNTED,
     FINISHED,
     ROLLOUT_ENDED,
-    UPDATES,
-    UPDATES_HERE,
     AgentTask,
     Scheduler,
 )
@@ -198,7 +196,6 @@ class JointLoop(Scheduler):
         self._groups: Sequence[AgentGroup] = ()
         #: The agents that learn in these groups
         self._elsewhere: set[str] = set()
-        self._in_round = False
         self.n_steps = 0
         super().__init__(
             env.num_envs,
@@ -223,13 +220,6 @@ class JointLoop(Scheduler):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return self.env.get_images()
-
-    def is_round_of(self, agent: str) -> bool:
-        """
-        :param agent: who is about to be updated
-        :return: whether it has ended its rollout and does so in its own ``learn()``, so that it can wait for others who do
-        """
-        return self._in_round and self._runs_now(agent)
 
     def reset(self) -> None:
         """Reset the joint environment; each agent gets its first observation in its ``learn()``."""
@@ -270,7 +260,7 @@ class JointLoop(Scheduler):
                     )
                     raise
         finally:
-            self._main, self._tasks, self._in_round = None, {}, False
+            self._main, self._tasks = None, {}
             self._groups, self._elsewhere = (), set()
             self._transitions, self._actions = {}, {}
 
@@ -349,18 +339,12 @@ class JointLoop(Scheduler):
             ended.clear()
             progress.on_rollout_end()
         # Each agent trains and chooses its next action in one turn
-        self._in_round, self.n_rounds = True, self.n_rounds + 1
+        self.n_rounds += 1
         for group in self._groups:
             if not set(now).isdisjoint(group.agents):
                 group.end_rollouts()
-        turns = now = self._in_this_process(now)
-        while turns:
-            self._take_turns(turns, rngs)
-            # With updates in several processes: first who is updated here, while the workers are busy, then all in their order
-            here = [agent for agent in now if self._tasks[agent].state == UPDATES_HERE]
-            turns = here or [agent for agent in now if self._tasks[agent].state == UPDATES]
+        self._take_turns(self._in_this_process(now), rngs)
         self._join()
-        self._in_round = False
         rngs.to(rng)
         learning = self._learning()
         progress.on_round_end(learning)

@@ -27,8 +27,6 @@ from sb3_belief.vec_env.team_vec_env import TeamObs
 ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
 # Its policy waits for those of other agents, to make their forward passes in one batch
 BATCHES_FORWARD = "batches forward"
-# With updates in several processes: it is to be updated in this one, or waits for the others to be
-UPDATES_HERE, UPDATES = "updates here", "updates"
 
 
 @dataclass

@@ -1,5 +1,5 @@
-"""Several processes share a team's agents: they update them and choose their actions."""
+"""Agents of one team learn in several processes at once."""
 
-from sb3_belief.team.parallel.sharing import ParallelLearning, check_jobs
+from sb3_belief.team.parallel.parallel_learning import ParallelLearning, check_jobs
 
 __all__ = ["ParallelLearning", "check_jobs"]

@@ -1,4 +1,4 @@
-"""The hub of agents that learn in a worker process, in lockstep with the rest of their team."""
+"""The scheduler of the agents in a worker process."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,43 +13,50 @@ from sb3_belief.vec_env.team_vec_env import TeamObs
 
 class GroupScheduler(Scheduler):
     """
-    A hub that is told by the one in the main process when it is whose turn. Between its methods no agent's random stream is
-    the current one.
+    A scheduler that the loop in the main process tells when to resume its agents.
 
-    :param first: {agent: observations of the reset, if there was one}
-    :param masks: {agent: its action masks}, if there are any
-    :param vote: whether agents that have counted a step wait to be told whether to go on
-    :param streams: lends the global generators
-    :param idle: the stream that has them meanwhile
-    :param kwargs: of ``Scheduler``
+    Between its methods no agent's random number generators are the current ones.
+
+    :param first: Observations of the reset by agent, if there was one
+    :param masks: Action masks by agent, if there are any
+    :param vote: Whether agents that have counted a step wait to learn whether training continues
+    :param rngs: Lends the global random number generators
+    :param idle: Has them in between
+    :param kwargs: Arguments of ``Scheduler``
     """
 
-    def __init__(self, first: TeamObs, masks: TeamObs | None, vote: bool, streams: RngSwitch, idle: RngState, **kwargs: Any):
-        self._given_masks = masks
+    def __init__(
+        self, first: TeamObs, masks: TeamObs | None, vote: bool, rngs: RngSwitch, idle: RngState, **kwargs: Any
+    ) -> None:
+        self._masks = masks
         super().__init__(**kwargs)
         self._first, self._vote = first, vote
-        self._streams, self._idle = streams, idle
-        self._moved: set[str] = set()
+        self._rngs, self._idle = rngs, idle
+        self._resumed: set[str] = set()
 
     @property
     def masks(self) -> dict[str, np.ndarray] | None:
-        return self._given_masks
+        return self._masks
 
     def start(self, tasks: dict[str, AgentTask]) -> None:
         """
-        :param members: who learns here
+        Run the agents up to their first actions.
+
+        :param tasks: The agents' tasks
         """
         self._tasks = tasks
-        self._start(tasks, self._streams)
+        self._start(tasks, self._rngs)
         self._end_turns(tasks)
 
-    def step(self, parts: dict[str, AgentTransition], masks: TeamObs | None) -> None:
+    def step(self, transitions: dict[str, AgentTransition], masks: TeamObs | None) -> None:
         """
-        :param parts: of the agents
-        :param masks: of the agents, if there are any
+        Let the agents count a step and, where there is no vote, finish it.
+
+        :param transitions: The agents' parts of the step
+        :param masks: Their action masks, if there are any
         """
-        self._hand_out(parts)
-        self._given_masks, self._continues = masks, True
+        self._hand_out(transitions)
+        self._masks, self._continues = masks, True
         if self._vote:
             for agent in self._learning():
                 self._resume(agent)
@@ -58,47 +65,53 @@ class GroupScheduler(Scheduler):
 
     def finish_step(self, continues: bool) -> None:
         """
-        :param continues: whether training continues
+        Let the agents do what follows after counting the step.
+
+        :param continues: Whether training continues
         """
         self._continues = continues
         learning = self._learning()
-        self._take_turns(learning, self._streams)
+        self._take_turns(learning, self._rngs)
         self._end_turns(learning)
 
     def end_rollouts(self) -> list[str]:
         """
-        Those who have ended a rollout are updated.
+        Let the agents that have ended a rollout train on it.
 
-        :return: who has been
+        :return: Their names
         """
         self.n_rounds += 1
         ended = [agent for agent in self._learning() if self._tasks[agent].state == ROLLOUT_ENDED]
-        self._take_turns(ended, self._streams)
+        self._take_turns(ended, self._rngs)
         self._end_turns(ended)
         return ended
 
     def act(self, agents: Sequence[str]) -> None:
         """
-        :param agents: who have finished learning, and act once more
+        Let agents act that have finished learning.
+
+        :param agents: Their names
         """
         for agent in agents:
-            self._act(agent, self._streams)
+            self._act(agent, self._rngs)
         self._end_turns(agents)
 
     def stop(self) -> None:
         """End the coroutines."""
         self._stop_all(None)
-        self._streams.to(self._idle)
+        self._rngs.to(self._idle)
 
-    def take_moves(self) -> tuple[dict[str, str], TeamObs]:
+    def take_result(self) -> tuple[dict[str, str], TeamObs]:
         """
-        :return: {agent: why it waits} and {agent: what it does} of those who have gone on since the last time
-        """
-        moved, self._moved = self._moved, set()
-        states = {agent: self._tasks[agent].state for agent in moved}
-        return states, {agent: self._actions[agent] for agent in moved if agent in self._actions}
+        Return what the loop needs to know.
 
-    def _end_turns(self, moved: Iterable[str]) -> None:
-        self._batch_forwards(self._streams)
-        self._streams.to(self._idle)
-        self._moved.update(moved)
+        :return: The state and the actions of each agent that was resumed since the last call
+        """
+        resumed, self._resumed = self._resumed, set()
+        states = {agent: self._tasks[agent].state for agent in resumed}
+        return states, {agent: self._actions[agent] for agent in resumed if agent in self._actions}
+
+    def _end_turns(self, resumed: Iterable[str]) -> None:
+        self._batch_forwards(self._rngs)
+        self._rngs.to(self._idle)
+        self._resumed.update(resumed)

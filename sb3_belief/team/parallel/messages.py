@@ -1,4 +1,4 @@
-"""Models and what changes in them, as messages between processes."""
+"""Models as messages between processes."""
 
 import io
 import pickle
@@ -14,27 +14,29 @@ from torch import nn
 
 class Message(NamedTuple):
     """
-    :param head: a pickle
-    :param buffers: the large arrays that it leaves out
+    A pickle whose large arrays travel beside it.
+
+    :param head: The pickle
+    :param buffers: The large arrays that it leaves out
     """
 
     head: bytes
     buffers: list[Any]
 
 
-# Bytes from which on an array is one
+# The least number of bytes of a large array
 _LARGE = 1 << 12
-# Finds what stands for itself in the message that is being read
+# Finds the object for a placeholder in the message that is being read
 _find: Callable[[Any], Any] = id
 
 
 class _Pickler(cloudpickle.Pickler):
     """
-    Also takes functions and classes that cannot be imported, and tensors in a tenth of the time of PyTorch's own way.
+    Pickles functions and classes that cannot be imported, too, and tensors in a tenth of the time that PyTorch takes.
 
-    :param file: where to write
-    :param known: {id of an object: what is written in its place}
-    :param buffers: where large arrays go
+    :param file: Gets the pickle
+    :param known: For the ids of some objects, the placeholders that are written instead
+    :param buffers: Gets the large arrays
     """
 
     def __init__(self, file: io.BytesIO, known: dict[int, Any], buffers: list[Any]):
@@ -64,9 +66,11 @@ class _Pickler(cloudpickle.Pickler):
 
 def dumps(obj: Any, known: dict[int, Any]) -> Message:
     """
-    :param obj: what is to be sent
-    :param known: {id of an object: what is sent in its place}
-    :return: to be sent before anything in it changes
+    Pickle an object.
+
+    :param obj: The object
+    :param known: For the ids of some objects, the placeholders that are sent instead
+    :return: The message, which shares the memory of the object's large arrays: to be sent before they change
     """
     file, buffers = io.BytesIO(), list[Any]()
     _Pickler(file, known, buffers).dump(obj)
@@ -75,9 +79,11 @@ def dumps(obj: Any, known: dict[int, Any]) -> Message:
 
 def loads(message: Message, find: Callable[[Any], Any] = id) -> Any:
     """
-    :param message: as it was received
-    :param find: gives the object that something stands for that was sent in its place
-    :return: what was sent
+    Unpickle a message.
+
+    :param message: As it was received
+    :param find: Returns the object for a placeholder
+    :return: The object
     """
     global _find
     before, _find = _find, find
@@ -91,40 +97,46 @@ def _recall(known: Any) -> Any:
     return _find(known)
 
 
-def send(connection: Connection, agent: str | None, content: Any) -> None:
+def send(connection: Connection, content: Any) -> None:
     """
-    :param connection: to the other process
-    :param agent: whom it is about; None for a branch
-    :param content: a ``Message``, or something small without tensors, whose pickle does not need one
+    Send something to another process.
+
+    :param connection: To the other process
+    :param content: A ``Message``, or something small without tensors that a plain pickle can hold
     """
     if not isinstance(content, Message):
-        connection.send((agent, None, content))
+        connection.send((None, content))
         return
     buffers = [buffer.raw() for buffer in content.buffers]
-    connection.send((agent, [buffer.nbytes for buffer in buffers], content.head))
+    connection.send(([buffer.nbytes for buffer in buffers], content.head))
     for buffer in buffers:
         connection.send_bytes(buffer)
 
 
-def receive(connection: Connection) -> tuple[str | None, Any]:
+def receive(connection: Connection) -> Any:
     """
-    :param connection: to the other process
-    :return: as they were sent: whom it is about, and what
+    Receive what :func:`send` has sent.
+
+    :param connection: To the other process
+    :return: The content
     """
-    agent, sizes, content = connection.recv()
+    sizes, content = connection.recv()
     if sizes is None:
-        return agent, content
+        return content
     buffers = [bytearray(size) for size in sizes]
     for buffer in buffers:
         connection.recv_bytes_into(buffer)
-    return agent, Message(content, buffers)
+    return Message(content, buffers)
 
 
 def own_tensor(array: np.ndarray, stride: tuple[int, ...]) -> th.Tensor:
     """
-    :param array: the values
-    :param stride: of the tensor that they were
-    :return: the same in memory and order of PyTorch's own: by where a tensor lies, matrix products may differ in the last bit
+    Make a tensor in PyTorch's own memory, with the strides that it had. Matrix products may differ in the last bit depending
+    on alignment and strides.
+
+    :param array: The values
+    :param stride: The strides of the original tensor
+    :return: The tensor
     """
     source = th.from_numpy(array)
     return th.empty_strided(source.shape, stride, dtype=source.dtype).copy_(source)

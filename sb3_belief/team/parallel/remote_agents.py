@@ -1,139 +1,101 @@
-"""
-Agents whose whole ``learn()`` runs in a worker process, as the main process sees them.
+"""Agents whose whole ``learn()`` runs in a worker process, as the main process sees them."""
 
-A rollout is SB3's own work for each agent: its policy, its buffer, its bookkeeping. All of that is shared out only if the
-agents' loops are. So their models move to a worker when a team begins to learn; all that goes to and fro then is what the
-agents are given of each joint step, and what they do. They come back when the team has learned, or when somebody looks at
-them, which is asked of the callbacks before (see ``leaves_models_alone``).
-"""
-
-import inspect
+import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
 from sb3_belief.common.rng import RngState
+from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.parallel.messages import dumps, loads
-from sb3_belief.team.parallel.updating import modules_of, pack_of, raise_failure, show, tell, write_buffer, write_changes
+from sb3_belief.team.parallel.model_state import pack, write_state
 from sb3_belief.team.parallel.worker_server import AgentPayload, Command, state_of, wrappers_of
 from sb3_belief.team.parallel.workers import Workers
 from sb3_belief.vec_env.agent_vec_env import AgentTransition
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
-if TYPE_CHECKING:
-    from sb3_belief.team.lockstep.joint_loop import JointLoop
-
-# Their callbacks take a model as something that predicts and can be saved
-_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
-_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-
-
-def leaves_models_alone(callback: BaseCallback | None) -> bool:
-    """
-    :param callback: of a team
-    :return: whether it looks at the team's models through the team's own methods only, and changes nothing in them: those of
-        SB3 and sb3-contrib, and what they call
-    """
-    if callback is None:
-        return True
-    if isinstance(callback, ConvertCallback):
-        return callback.callback is None
-    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
-        return False
-    called = [
-        *getattr(callback, "callbacks", []),
-        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
-    ]
-    return all(leaves_models_alone(each) for each in called)
-
-
-def can_learn_elsewhere(model: BaseAlgorithm, scheduler: "JointLoop", agent: str) -> bool:
-    """
-    :param model: of an agent
-    :param hub: in which it learns
-    :param agent: its name
-    :return: whether its methods are those of its class, nobody has hooked into its networks, and its environment is the one
-        that the team has given it
-    """
-    for owner in (model, model.policy):
-        if any(inspect.isroutine(getattr(type(owner), name, None)) for name in vars(owner)):
-            return False
-    if any(vars(module)[hooks] for _, module in modules_of(model) for hooks in _HOOKS):
-        return False
-    return model.env is not None and model.env.unwrapped is scheduler.agent_envs[agent]
+# For Python's rule that a warning is shown once per place
+_shown: dict[Any, Any] = {}
 
 
 class RemoteAgents:
     """
-    A branch that learns in a worker (see ``lockstep.Branch``).
+    An agent group (see ``joint_loop.AgentGroup``) that learns in a worker.
 
-    :param hub: in which the rest learns
-    :param workers: the processes
-    :param number: of the worker
-    :param models: of the agents, kept as they were before, until they are looked at
-    :param streams: what they draw from
-    :param learn: runs ``learn()`` of a model with a callback
+    :param loop: The team's loop
+    :param workers: The worker processes
+    :param number: Number of this group's worker
+    :param models: The agents' models. They stay as they were until :meth:`sync` or :meth:`close`
+    :param rngs: The agents' random number generators
+    :param learn: Runs a model's ``learn()``, called with the model and a callback
     """
 
     def __init__(
         self,
-        scheduler: "JointLoop",
+        loop: JointLoop,
         workers: Workers,
         number: int,
         models: Mapping[str, BaseAlgorithm],
-        streams: Mapping[str, RngState],
+        rngs: Mapping[str, RngState],
         learn: Callable[..., None],
     ):
         self.agents = list(models)
-        self._scheduler, self._workers, self._number = scheduler, workers, number
-        self._models, self._streams, self._learn = dict(models), streams, learn
+        self._loop, self._workers, self._number = loop, workers, number
+        self._models, self._rngs, self._learn = dict(models), rngs, learn
         self._vote = True
-        self._is_open, self._is_busy, self._has_moved = False, False, False
+        # Whether the models are there, whether a command is being carried out, and whether one was since the last sync
+        self._is_open, self._is_busy, self._is_stale = False, False, False
         self._answer: dict[str, Any] | None = None
 
     def _send(self, method: str, *args: Any, is_answered: bool = True) -> None:
-        order = Command(method, args, is_answered)
-        # The models are more than a simple message
-        self._workers.send(self._number, None, dumps(order, {}) if method == "open" else order, ", ".join(self.agents))
-        self._is_busy, self._has_moved = is_answered, True
+        command = Command(method, args, is_answered)
+        # Only models need more than a plain pickle
+        message = dumps(command, {}) if method == "open" else command
+        self._workers.send(self._number, message, ", ".join(self.agents))
+        self._is_busy, self._is_stale = is_answered, True
 
     def _receive(self) -> dict[str, Any]:
-        """The answer to the last order, with what was raised in it."""
-        answer = loads(self._workers.receive(self._number, None))
+        """Return the answer to the last command, after its output, warnings and logs are shown and written here."""
+        answer = loads(self._workers.receive(self._number))
         self._is_busy = False
-        show(answer)
-        for agent, log in answer["log"].items():
-            tell(self._models[agent], log)
+        if answer["output"]:
+            sys.stdout.write(answer["output"])
+        for message, category, filename, lineno in answer["warnings"]:
+            warnings.warn_explicit(message, category, filename, lineno, registry=_shown)
+        for agent, calls in answer["log"].items():
+            for method, args, kwargs in calls:
+                getattr(self._models[agent].logger, method)(*args, **kwargs)
         return answer
 
-    # For the hub
+    # For the loop
 
     def start(self, first: TeamObs, masks: TeamObs | None, vote: bool) -> None:
-        scheduler, self._vote = self._scheduler, vote
+        loop, self._vote = self._loop, vote
         scheduler_kwargs = {
             "first": first,
             "masks": self._of_these(masks),
             "vote": vote,
-            "num_envs": scheduler.num_envs,
-            "observation_spaces": {agent: scheduler.observation_spaces[agent] for agent in self.agents},
-            "action_spaces": scheduler.action_spaces,
-            "scripted_action_spaces": scheduler.scripted_action_spaces,
-            "render_mode": scheduler.render_mode,
+            "num_envs": loop.num_envs,
+            "observation_spaces": {agent: loop.observation_spaces[agent] for agent in self.agents},
+            "action_spaces": loop.action_spaces,
+            "scripted_action_spaces": loop.scripted_action_spaces,
+            "render_mode": loop.render_mode,
         }
-        arriving = {agent: self._arriving(agent) for agent in self.agents}
+        payloads = {agent: self._payload(agent) for agent in self.agents}
         self._is_open = True
-        self._send("open", arriving, self._learn, scheduler_kwargs)
+        self._send("open", payloads, self._learn, scheduler_kwargs)
 
-    def _arriving(self, agent: str) -> AgentPayload:
+    def _payload(self, agent: str) -> AgentPayload:
         model = self._models[agent]
         wrappers = [(type(wrapper), state_of(wrapper)) for wrapper in wrappers_of(model.env)]
-        return AgentPayload(pack_of(agent, model), wrappers, self._streams[agent])
+        return AgentPayload(pack(agent, model), wrappers, self._rngs[agent])
 
-    def step(self, parts: dict[str, AgentTransition], masks: TeamObs | None) -> None:
-        self._send("step", {agent: parts[agent] for agent in self.agents}, self._of_these(masks), is_answered=not self._vote)
+    def step(self, transitions: dict[str, AgentTransition], masks: TeamObs | None) -> None:
+        own = {agent: transitions[agent] for agent in self.agents}
+        self._send("step", own, self._of_these(masks), is_answered=not self._vote)
 
     def finish_step(self, continues: bool) -> None:
         self._send("finish_step", continues)
@@ -149,11 +111,11 @@ class RemoteAgents:
         answer, self._answer = self._answer, None
         if answer is None:
             return {}, {}
-        raise_failure(answer)
+        _raise_failure(answer)
         return answer["states"], answer["actions"]
 
     def _wait(self) -> None:
-        """Keep what has come of the last order, if nobody has asked for it yet."""
+        """Keep the answer to the last command until the loop asks for it."""
         if self._is_busy:
             self._answer = self._receive()
 
@@ -162,37 +124,46 @@ class RemoteAgents:
 
     # For the team
 
-    def look(self) -> None:
+    def sync(self) -> None:
         """
-        Make the models here what they are there.
+        Bring the models here up to date with those in the worker.
 
-        :raises BaseException: if that cannot be
+        :raises BaseException: If that fails
         """
-        if self._is_open and self._has_moved:
+        if self._is_open and self._is_stale:
             self._wait()
-            self._bring("look")
-            self._has_moved = False
+            self._fetch("sync")
+            self._is_stale = False
 
     def close(self) -> None:
         """
-        The same, and nothing is under way there any more.
+        Bring the models here up to date, rollout buffers included, and end what runs in the worker.
 
-        :raises BaseException: if that cannot be
+        :raises BaseException: If that fails
         """
         if self._is_open:
             self._is_open = False
             self._wait()
-            self._bring("close")
+            self._fetch("close")
 
-    def _bring(self, method: str) -> None:
+    def _fetch(self, method: str) -> None:
         self._send(method)
         answer = self._receive()
-        for agent, changes in answer["changes"].items():
+        for agent, payload in answer["payloads"].items():
             model = self._models[agent]
-            write_changes(model, changes["model"])
-            for wrapper, state in zip(wrappers_of(model.env), changes["wrappers"], strict=True):
+            write_state(model, payload["model"])
+            for wrapper, state in zip(wrappers_of(model.env), payload["wrappers"], strict=True):
                 vars(wrapper).update({key: value for key, value in state.items() if not isinstance(value, spaces.Space)})
-            self._streams[agent].become(changes["stream"])
-            if changes["buffer"] is not None:
-                write_buffer(model, changes["buffer"])
-        raise_failure(answer)
+            self._rngs[agent].become(payload["rng"])
+        _raise_failure(answer)
+
+
+def _raise_failure(answer: dict[str, Any]) -> None:
+    if answer["error"] is not None:
+        # As concurrent.futures shows where it happened
+        raise answer["error"] from _WorkerTraceback(answer["traceback"])
+
+
+class _WorkerTraceback(Exception):
+    def __str__(self) -> str:
+        return f'\n"""\n{self.args[0]}"""'

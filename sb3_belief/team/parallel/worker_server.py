@@ -1,42 +1,51 @@
-"""In a worker process: models that learn there, from when they arrive until they are sent back."""
+"""What a worker process does: it carries out commands about the agents that learn in it."""
 
 import inspect
+import io
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
+from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 
+from sb3_belief.common.processes import leave_interrupts_to_main
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.scheduler import AgentTask
-from sb3_belief.team.parallel.arrived import ModelSnapshot, Recorder, captured, failure_of, rebuild
 from sb3_belief.team.parallel.group_scheduler import GroupScheduler
-from sb3_belief.team.parallel.messages import Message, dumps, loads
+from sb3_belief.team.parallel.messages import Message, dumps, loads, receive, send
+from sb3_belief.team.parallel.model_state import StateReader, unpack
 from sb3_belief.team.predictor import Predictor
+
+LogCall = tuple[str, tuple, dict[str, Any]]
 
 
 class AgentPayload(NamedTuple):
     """
-    An agent that is to learn in another process.
+    An agent on its way to a worker.
 
-    :param model: as ``pack`` made it
-    :param wrappers: class and state of those around its environment, the outermost first
-    :param stream: what it draws from
+    :param model: As ``pack`` made it
+    :param wrappers: Class and state of those around its environment, the outermost first
+    :param rng: Its random number generators
     """
 
     model: Message
     wrappers: list[tuple[type[VecEnvWrapper], dict[str, Any]]]
-    stream: RngState
+    rng: RngState
 
 
 class Command(NamedTuple):
     """
-    :param method: of ``GroupScheduler``, or one of ``WorkerServer``
-    :param args: of the method
-    :param is_answered: whether it has an answer; otherwise another order follows, which has
+    What a worker is to do.
+
+    :param method: Name of a method of ``GroupScheduler`` or ``WorkerServer``
+    :param args: Arguments of the method
+    :param is_answered: Whether the worker answers; otherwise another command follows that it answers
     """
 
     method: str
@@ -44,16 +53,18 @@ class Command(NamedTuple):
     is_answered: bool = True
 
 
-# Orders that are also about the models; the others are the hub's
-_OWN = ("open", "end_rollouts", "look", "close")
-# Of a wrapper, what belongs to where it is
-_OF_ITS_PLACE = ("venv", "class_attributes")
+# Commands that are about the models, too; the others go to the scheduler
+_OWN = ("open", "end_rollouts", "sync", "close")
+# Attributes of a wrapper that belong to the process it is in
+_OF_THE_PROCESS = ("venv", "class_attributes")
 
 
 def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
     """
-    :param env: of a model
-    :return: what is around the agent's own environment, the outermost first
+    Iterate over the wrappers around an agent's environment.
+
+    :param env: Environment of a model
+    :return: The wrappers, the outermost first
     """
     while isinstance(env, VecEnvWrapper):
         yield env
@@ -62,119 +73,188 @@ def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
 
 def state_of(wrapper: VecEnvWrapper) -> dict[str, Any]:
     """
-    :param wrapper: around an agent's environment
-    :return: all of it but what it wraps
+    Return the state of a wrapper: all its attributes except what it wraps.
+
+    :param wrapper: Around an agent's environment
     """
-    return {name: value for name, value in vars(wrapper).items() if name not in _OF_ITS_PLACE}
+    return {name: value for name, value in vars(wrapper).items() if name not in _OF_THE_PROCESS}
+
+
+class LogRecorder(Logger):
+    """Records what is logged in a worker, for the model's own logger in the main process."""
+
+    def __init__(self) -> None:
+        super().__init__(None, [])
+        self.calls: list[LogCall] = []
+
+    def take(self) -> list[LogCall]:
+        """Return the calls since the last time: methods and their arguments."""
+        calls, self.calls = self.calls, []
+        return calls
+
+    def record(self, *args: Any, **kwargs: Any) -> None:
+        self.calls.append(("record", args, kwargs))
+        super().record(*args, **kwargs)
+
+    def record_mean(self, *args: Any, **kwargs: Any) -> None:
+        self.calls.append(("record_mean", args, kwargs))
+        super().record_mean(*args, **kwargs)
+
+    def log(self, *args: Any, **kwargs: Any) -> None:
+        self.calls.append(("log", args, kwargs))
+
+    def dump(self, *args: Any, **kwargs: Any) -> None:
+        self.calls.append(("dump", args, kwargs))
+        super().dump(*args, **kwargs)
 
 
 class WorkerServer:
-    """One branch of a team after another learns here, each from ``open`` to ``close``."""
+    """Lets one group of agents after another learn, each from ``open`` to ``close``."""
 
     def __init__(self) -> None:
-        self._found = _nothing()
+        self._answer = _empty_answer()
         self._clear()
 
     def _clear(self) -> None:
         self._stack = ExitStack()
         self._scheduler: GroupScheduler | None = None
-        self._models: dict[str, BaseAlgorithm] = {}
-        self._streams: dict[str, RngState] = {}
-        self._recorders: dict[str, Recorder] = {}
-        self._before: dict[str, ModelSnapshot] = {}
-        # Of whom it is not known yet that they can be sent back after an update
-        self._unchecked: set[str] = set()
+        self._models: dict[str, Any] = {}
+        self._rngs: dict[str, RngState] = {}
+        self._recorders: dict[str, LogRecorder] = {}
+        self._readers: dict[str, StateReader] = {}
+        # Agents of which no state has been read yet after an update
+        self._unread: set[str] = set()
 
-    def do(self, order: Command | Message) -> Message | None:
+    def do(self, message: Command | Message) -> Message | None:
         """
-        :param order: from the main process
-        :return: the answer, if there is to be one: with what was raised, but else as always, if the order has failed
+        Carry out a command.
+
+        :param message: From the main process
+        :return: The answer, if there is one. It holds what was raised, but is as always otherwise, if the command has failed
         """
         is_answered = True
-        with captured(self._found):
+        with _captured(self._answer):
             try:
-                method, args, is_answered = loads(order) if isinstance(order, Message) else order
+                method, args, is_answered = loads(message) if isinstance(message, Message) else message
                 if method in _OWN:
                     getattr(self, method)(*args)
-                elif self._found["error"] is None:
+                elif self._answer["error"] is None:
                     getattr(self._scheduler, method)(*args)
             except BaseException as error:
-                self._found.update(failure_of(error))
+                self._answer.update(_failure(error))
         if not is_answered:
             return None
         if self._scheduler is not None:
-            self._found["states"], self._found["actions"] = self._scheduler.take_moves()
-        self._found["log"] = {agent: recorder.take() for agent, recorder in self._recorders.items()}
-        found, self._found = self._found, _nothing()
+            self._answer["states"], self._answer["actions"] = self._scheduler.take_result()
+        self._answer["log"] = {agent: recorder.take() for agent, recorder in self._recorders.items()}
+        answer, self._answer = self._answer, _empty_answer()
         if self._scheduler is None:
             self._clear()
         try:
-            return dumps(found, {})
+            return dumps(answer, {})
         except Exception as error:
-            return dumps({**_nothing(), **failure_of(error)}, {})
+            return dumps({**_empty_answer(), **_failure(error)}, {})
 
-    def open(self, arriving: dict[str, AgentPayload], learn: Callable[..., None], scheduler_kwargs: dict[str, Any]) -> None:
+    def open(self, payloads: dict[str, AgentPayload], learn: Callable[..., None], scheduler_kwargs: dict[str, Any]) -> None:
         """
-        :param arriving: the agents
-        :param learn: runs ``learn()`` of a model with a callback
-        :param hub_kwargs: of ``GroupScheduler``
+        Build the models and run them up to their first actions.
+
+        :param payloads: The agents
+        :param learn: Runs a model's ``learn()``, called with the model and a callback
+        :param scheduler_kwargs: Arguments of ``GroupScheduler``
         """
         idle = RngState(0)
-        streams = self._stack.enter_context(RngSwitch(idle))
-        scheduler = GroupScheduler(streams=streams, idle=idle, **scheduler_kwargs)
+        rngs = self._stack.enter_context(RngSwitch(idle))
+        scheduler = GroupScheduler(rngs=rngs, idle=idle, **scheduler_kwargs)
         tasks: dict[str, AgentTask] = {}
-        for agent, (job, wrappers, stream) in arriving.items():
-            recorder = self._recorders[agent] = Recorder()
-            model = self._models[agent] = rebuild(job, recorder)
+        for agent, (message, wrappers, rng) in payloads.items():
+            recorder = self._recorders[agent] = LogRecorder()
+            model = self._models[agent] = unpack(message, recorder)
             env: VecEnv = scheduler.agent_envs[agent]
             for wrapper_class, state in reversed(wrappers):
                 wrapper = wrapper_class.__new__(wrapper_class)
                 vars(wrapper).update(state, venv=env, class_attributes=dict(inspect.getmembers(wrapper_class)))
                 env = wrapper
             model.env, model._vec_normalize_env = env, unwrap_vec_normalize(env)
-            self._before[agent], self._streams[agent] = ModelSnapshot(model), stream
-            tasks[agent] = AgentTask(partial(learn, model), Predictor(model, model._vec_normalize_env).act, stream)
-        self._unchecked = set(tasks)
-        self._stack.enter_context(batched_forwards(scheduler, self._models))  # type: ignore[arg-type]
+            self._readers[agent], self._rngs[agent] = StateReader(model), rng
+            tasks[agent] = AgentTask(partial(learn, model), Predictor(model, model._vec_normalize_env).act, rng)
+        self._unread = set(tasks)
+        self._stack.enter_context(batched_forwards(scheduler, self._models))
         self._scheduler = scheduler
         scheduler.start(tasks)
 
     def end_rollouts(self) -> None:
-        """Those who have ended a rollout are updated."""
+        """Let the agents that have ended a rollout train on it."""
         assert self._scheduler is not None
-        for agent in self._unchecked.intersection(self._scheduler.end_rollouts()):
-            # Rather now than when there is much to lose
-            self._before[agent].check()
-            self._unchecked.remove(agent)
+        for agent in self._unread.intersection(self._scheduler.end_rollouts()):
+            # A model that cannot be sent back is better found out now than when there is much to lose
+            self._readers[agent].read(with_buffer=False)
+            self._unread.remove(agent)
 
-    def look(self) -> None:
-        """Say how the models are."""
-        self._find_changes(with_buffers=False)
+    def sync(self) -> None:
+        """Send the models' states, without their rollout buffers."""
+        self._read_states(with_buffers=False)
 
     def close(self) -> None:
-        """End what is under way, and say how the models are."""
+        """Stop the agents, and send the models' states."""
         try:
             if self._scheduler is not None:
                 self._scheduler.stop()
-                self._find_changes(with_buffers=True)
+                self._read_states(with_buffers=True)
         finally:
             self._stack.close()
             self._scheduler = None
 
-    def _find_changes(self, with_buffers: bool) -> None:
-        for agent, before in self._before.items():
-            env = self._models[agent].env
+    def _read_states(self, with_buffers: bool) -> None:
+        for agent, reader in self._readers.items():
             try:
-                self._found["changes"][agent] = {
-                    "model": before.changes(),
-                    "wrappers": [state_of(wrapper) for wrapper in wrappers_of(env)],
-                    "stream": self._streams[agent],
-                    "buffer": before.buffer() if with_buffers else None,
+                self._answer["payloads"][agent] = {
+                    "model": reader.read(with_buffers),
+                    "wrappers": [state_of(wrapper) for wrapper in wrappers_of(self._models[agent].env)],
+                    "rng": self._rngs[agent],
                 }
             except Exception as error:
-                # The others are not lost with it
-                self._found.update(failure_of(error))
+                # The other agents' states are not lost with it
+                self._answer.update(_failure(error))
 
 
-def _nothing() -> dict[str, Any]:
-    return {"output": "", "warnings": [], "error": None, "states": {}, "actions": {}, "log": {}, "changes": {}}
+def _empty_answer() -> dict[str, Any]:
+    return {"output": "", "warnings": [], "error": None, "states": {}, "actions": {}, "log": {}, "payloads": {}}
+
+
+@contextmanager
+def _captured(answer: dict[str, Any]) -> Iterator[None]:
+    """Add to an answer what is printed and warned within the block."""
+    output = io.StringIO()
+    with warnings.catch_warnings(record=True) as caught, redirect_stdout(output):
+        warnings.simplefilter("always")
+        yield
+    answer["output"] += output.getvalue()
+    answer["warnings"] += [(str(w.message), w.category, w.filename, w.lineno) for w in caught]
+
+
+def _failure(error: BaseException) -> dict[str, Any]:
+    """Return an error and its traceback so that they can be sent."""
+    text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+    try:
+        loads(dumps(error, {}))
+    except Exception:
+        error = RuntimeError(f"{type(error).__name__}: {error}")
+    return {"error": error, "traceback": text}
+
+
+def serve(connection: Connection) -> None:
+    """
+    Carry out the commands of the main process until it closes the connection.
+
+    :param connection: To the main process
+    """
+    leave_interrupts_to_main()
+    server = WorkerServer()
+    try:
+        while True:
+            if (answer := server.do(receive(connection))) is not None:
+                send(connection, answer)
+    except (EOFError, OSError):
+        # The team is gone
+        pass

@@ -2,43 +2,44 @@
 
 import os
 import weakref
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import Any
 
 from sb3_belief.common.processes import Inbox, start_context
 from sb3_belief.team.parallel.messages import receive, send
-from sb3_belief.team.parallel.worker import serve
+from sb3_belief.team.parallel.worker_server import serve
 
 
-class _Worker(NamedTuple):
+@dataclass
+class _Worker:
     """
-    :param process: itself
-    :param connection: to it
-    :param inbox: of that connection
-    :param waiting: {whose job it has been given, see ``Workers.send``: who that is, in words}, in order
-    :param arrived: {whose: result that has been read before it was asked for}
+    A worker process as the main process knows it.
+
+    :param process: The process
+    :param connection: To the process
+    :param inbox: Of that connection
+    :param busy_with: The agents of the last command, for messages
     """
 
     process: Any
     connection: Connection
     inbox: Inbox
-    waiting: dict[str | None, str]
-    arrived: dict[str | None, Any]
+    busy_with: str = ""
 
 
 class Workers:
-    """Processes in which agents learn or are updated, ended with the last reference to this."""
+    """Processes in which agents learn. They end with the last reference to this object."""
 
     def __init__(self) -> None:
         self._all: list[_Worker] = []
         weakref.finalize(self, _end, self._all, os.getpid())
 
-    def __len__(self) -> int:
-        return len(self._all)
-
     def start(self, n: int) -> None:
         """
-        :param n: how many there are to be
+        Start workers, if there are not enough.
+
+        :param n: How many are needed
         """
         if any(not worker.process.is_alive() for worker in self._all):
             self.end()
@@ -48,52 +49,52 @@ class Workers:
             process = context.Process(target=serve, args=(there,), name=f"team-worker-{i}", daemon=True)
             process.start()
             there.close()
-            self._all.append(_Worker(process, here, Inbox(here, process), {}, {}))
+            self._all.append(_Worker(process, here, Inbox(here, process)))
 
-    def send(self, number: int, agent: str | None, job: Any, whose: str = "") -> None:
+    def send(self, number: int, content: Any, agents: str) -> None:
         """
-        :param number: of the worker
-        :param agent: whose job it is; None: of the branch of the team that learns there
-        :param job: to do after those it has
-        :param whose: who that is, if not an agent
-        :raises RuntimeError: if the worker is dead
+        Send a command to a worker.
+
+        :param number: Number of the worker
+        :param content: The command
+        :param agents: Names of the agents that it is about
+        :raises RuntimeError: If the worker is dead
         """
         worker = self._all[number]
-        worker.waiting[agent] = whose or str(agent)
+        worker.busy_with = agents
         try:
-            send(worker.connection, agent, job)
+            send(worker.connection, content)
         except OSError as error:
             raise self._death(number) from error
         except BaseException:
             self._lose(number)
             raise
 
-    def receive(self, number: int, agent: str | None) -> Any:
+    def receive(self, number: int) -> Any:
         """
-        :param number: of the worker
-        :param agent: whose job it was given, as for ``send``
-        :return: the result
-        :raises RuntimeError: if the worker died over it
+        Wait for a worker's answer.
+
+        :param number: Number of the worker
+        :return: The answer
+        :raises RuntimeError: If the worker died
         """
         worker = self._all[number]
-        while agent not in worker.arrived:
-            try:
-                worker.inbox.wait()
-            except (EOFError, OSError) as error:
-                raise self._death(number) from error
-            try:
-                whose, result = receive(worker.connection)
-            except (EOFError, OSError) as error:
-                raise self._death(number) from error
-            except BaseException:
-                self._lose(number)
-                raise
-            worker.waiting.pop(whose, None)
-            worker.arrived[whose] = result
-        return worker.arrived.pop(agent)
+        try:
+            worker.inbox.wait()
+        except (EOFError, OSError) as error:
+            raise self._death(number) from error
+        try:
+            return receive(worker.connection)
+        except (EOFError, OSError) as error:
+            raise self._death(number) from error
+        except BaseException:
+            self._lose(number)
+            raise
 
     def _lose(self, number: int) -> None:
-        """A message is cut off, by Ctrl-C for instance: nobody can tell where the next one begins."""
+        """
+        Give up a worker after a message was cut off, by Ctrl-C for instance: the next one could not be found in the pipe.
+        """
         self._all[number].connection.close()
         self._all[number].process.terminate()
 
@@ -102,20 +103,19 @@ class Workers:
         # It may need a moment to end
         worker.process.join(1.0)
         return RuntimeError(
-            f"Worker process {number} (exit code {worker.process.exitcode}) died while it was busy with"
-            f" {', '.join(worker.waiting.values())}; see its own error above, if it could write one. Models that learned in it"
-            " are what they were before this learn(), or when they were last saved or evaluated. The next learn() starts new"
-            " workers; with jobs=1 there are none. A script that uses them needs the line"
-            " 'if __name__ == \"__main__\":' before what it does."
+            f"Worker process {number} (exit code {worker.process.exitcode}) died while it was busy with {worker.busy_with};"
+            " see its own error above, if it could write one. Models that learned in it are what they were before learn(),"
+            " or when they were last saved or evaluated. The next learn() starts new workers; with jobs=1 there are none. A"
+            " script that uses them needs the line 'if __name__ == \"__main__\":' before what it does."
         )
 
     def end(self) -> None:
-        """End them all, whatever they do."""
+        """End all workers, whatever they do."""
         _end(self._all, os.getpid())
 
 
 def _end(workers: list[_Worker], pid: int) -> None:
-    # Not by a forked child, which has a copy of the list
+    # A forked child has a copy of the list, but must not end its parent's workers
     if os.getpid() == pid:
         for worker in workers:
             worker.connection.close()

@@ -1,6 +1,7 @@
 """Agents that learn in other processes: who does, and that whoever looks at them sees what they are."""
 
 import os
+import warnings
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from stable_baselines3.common.callbacks import (
 
 from sb3_belief import BeliefPPO
 from sb3_belief.team.parallel import workers
-from sb3_belief.team.parallel.remote_agents import leaves_models_alone
+from sb3_belief.team.parallel.parallel_learning import leaves_models_alone
 from tests.team.helpers import Record, Team, make_team_env, parameters
 from tests.team.parallel.test_jobs import (
     EASY,
@@ -84,7 +85,7 @@ def with_own_method(team):
 
 
 # Arguments of the team, callbacks of learn() by a folder to write to, what else is done, and whether the first agent learns
-# elsewhere; it is updated there in any case
+# elsewhere
 WHO: dict[str, tuple[dict[str, Any], dict[str, Any], Any, bool]] = {
     "nobody looks": ({}, {}, None, True),
     "SB3 looks": ({}, {"callback": lambda path: CheckpointCallback(4, path)}, None, True),
@@ -100,6 +101,7 @@ WHO: dict[str, tuple[dict[str, Any], dict[str, Any], Any, bool]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:All agents learn in one process")
 @pytest.mark.parametrize("case", WHO)
 def test_who_learns_elsewhere(case, tmp_path):
     kwargs, learn_kwargs, prepare, is_away = WHO[case]
@@ -113,12 +115,24 @@ def test_who_learns_elsewhere(case, tmp_path):
             team.learn(16 * n_rollouts, **callbacks, reset_num_timesteps=False)
         first, second = team.agents.values()
         assert (first.acted_in != {os.getpid()}) == (jobs == 2 and is_away)
-        assert (first.trained_in != {os.getpid()}) == (jobs == 2)
+        assert first.trained_in == first.acted_in
         assert second.acted_in == second.trained_in == {os.getpid()}
         del first.acted_in, first.trained_in, second.acted_in, second.trained_in
         results.append(everything(team, {} if is_away else {"agent_0": Draws()}))
         assert all("forward" not in vars(model.policy) for model in team.agents.values())
     assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("jobs, warned", [(1, 0), (2, 2)])
+def test_a_callback_that_keeps_all_agents_here_is_warned_of(jobs, warned):
+    team = toy_team(PPO, jobs, **PPO_SMALL)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            team.learn(16, callback=Record())
+        team.learn(16, callback=StopTrainingOnMaxEpisodes(100), agent_callbacks={"agent_0": Record()})
+    messages = [str(w.message) for w in caught if "one process" in str(w.message)]
+    assert len(messages) == warned and all("although jobs=2" in m and "use jobs=1" in m for m in messages)
 
 
 class Own(EvalCallback):

@@ -1,0 +1,184 @@
+"""
+A team's agents on several cores.
+
+Agents are independent, so those with on-policy algorithms can learn at the same time: each group of them in a process of its
+own, with the whole ``learn()`` of each agent (its policy, buffer, update and bookkeeping). Their models move to a worker when
+a team begins to learn. From then on all that travels is each agent's part of the joint steps and its actions. The models come
+back when the team has learned, or when something looks at them. What is learned, drawn and logged is the same as in one
+process, bit for bit.
+"""
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_belief.common.rng import RngState
+from sb3_belief.team.batched_forward import batched_forwards
+from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.parallel.model_state import modules_of, pack
+from sb3_belief.team.parallel.remote_agents import RemoteAgents
+from sb3_belief.team.parallel.workers import Workers
+
+# Callbacks of these libraries use a model only to predict and to save it
+_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+
+
+def check_jobs(jobs: Any) -> int:
+    """
+    Check a number of processes.
+
+    :param jobs: What the user gave
+    :return: The same
+    :raises ValueError: If it is not a whole number of at least 1
+    """
+    if not isinstance(jobs, int) or isinstance(jobs, bool) or jobs < 1:
+        raise ValueError(f"jobs is {jobs!r}; it must be a whole number of at least 1: the processes that work for the agents.")
+    return jobs
+
+
+def leaves_models_alone(callback: BaseCallback | None) -> bool:
+    """
+    Tell whether a team's callback uses the models through the team's own methods only, and changes nothing in them.
+
+    This holds for the callbacks of SB3 and sb3-contrib, if it holds for those that they call.
+
+    :param callback: Of a team
+    """
+    if callback is None:
+        return True
+    if isinstance(callback, ConvertCallback):
+        return callback.callback is None
+    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
+        return False
+    called = [
+        *getattr(callback, "callbacks", []),
+        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
+    ]
+    return all(leaves_models_alone(each) for each in called)
+
+
+def can_learn_elsewhere(model: BaseAlgorithm, loop: JointLoop, task: AgentTask) -> bool:
+    """
+    Tell whether nothing in this process takes part in an agent's learning.
+
+    :param model: The agent's model
+    :param loop: Its team's loop
+    :param task: The agent's task
+    :return: False for a callback of the agent's own, replaced methods, hooks in a network, and another environment than the
+        team's
+    """
+    if task.callback is not None or model.env is None or model.env.unwrapped not in loop.agent_envs.values():
+        return False
+    for owner in (model, model.policy):
+        if any(inspect.isroutine(getattr(type(owner), name, None)) for name in vars(owner)):
+            return False
+    return not any(vars(module)[hooks] for _, module in modules_of(model) for hooks in _HOOKS)
+
+
+class ParallelLearning:
+    """
+    Decides which agents learn in which process: the n-th on-policy agent in process n modulo their number, the last of which
+    is the main process.
+
+    :param models: The team's models by agent; those that are not on-policy stay in the main process
+    :param rngs: Their random number generators
+    :param jobs: Number of processes, the main one included; no more are used than there are on-policy agents
+    :raises ValueError: If there are several, and a model is not on the CPU
+    """
+
+    def __init__(self, models: Mapping[str, BaseAlgorithm], rngs: Mapping[str, RngState], jobs: int):
+        self._models, self._rngs, self._jobs = models, rngs, check_jobs(jobs)
+        self._workers = Workers()
+        self._groups: list[RemoteAgents] = []
+        self._on_policy()
+
+    def _on_policy(self) -> dict[str, OnPolicyAlgorithm]:
+        found = {agent: model for agent, model in self._models.items() if isinstance(model, OnPolicyAlgorithm)}
+        for agent, model in found.items():
+            if min(self._jobs, len(found)) > 1 and model.device.type != "cpu":
+                raise ValueError(
+                    f"jobs={self._jobs} is for models on the CPU, but that of {agent!r} is on {model.device}: use jobs=1, or"
+                    ' device="cpu".'
+                )
+        return found
+
+    def sync_models(self) -> None:
+        """Bring the models in this process up to date with those in the workers."""
+        for group in self._groups:
+            group.sync()
+
+    @contextmanager
+    def distribute(
+        self, loop: JointLoop, tasks: Mapping[str, AgentTask], learn: Callable[..., None], callback: BaseCallback
+    ) -> Iterator[Sequence[RemoteAgents]]:
+        """
+        Let agents learn in workers within the block, and batch the forward passes of those that stay.
+
+        Workers continue to wait for the next block, unless an error ends this one.
+
+        :param loop: The team's loop
+        :param tasks: The agents' tasks
+        :param learn: Runs a model's ``learn()``, called with the model and a callback
+        :param callback: The team's callback
+        :return: The agents that learn in workers
+        :raises ValueError: If a model cannot be sent to a worker
+        """
+        models = self._on_policy()
+        by_worker = self._choose(models, loop, tasks, callback)
+        away = {agent for group in by_worker.values() for agent in group}
+        try:
+            self._groups = [
+                RemoteAgents(loop, self._workers, worker, group, self._rngs, learn) for worker, group in by_worker.items()
+            ]
+            with batched_forwards(loop, {agent: model for agent, model in models.items() if agent not in away}):
+                yield self._groups
+            for group in self._groups:
+                group.close()
+        except BaseException:
+            try:
+                # What a worker that is dead or has failed cannot send back stays as it was
+                for group in self._groups:
+                    with suppress(Exception):
+                        group.close()
+            finally:
+                self._workers.end()
+            raise
+        finally:
+            self._groups = []
+
+    def _choose(
+        self,
+        models: Mapping[str, OnPolicyAlgorithm],
+        loop: JointLoop,
+        tasks: Mapping[str, AgentTask],
+        callback: BaseCallback,
+    ) -> dict[int, dict[str, BaseAlgorithm]]:
+        """Return the models that move to each worker, and start the workers."""
+        n_processes = min(self._jobs, len(models))
+        if n_processes <= 1:
+            return {}
+        if not leaves_models_alone(callback):
+            warnings.warn(
+                f"All agents learn in one process, although jobs={self._jobs}: the team has a callback that is not from SB3"
+                " or sb3-contrib, which may look at the models or change them at any step. Leave it out, or use jobs=1."
+            )
+            return {}
+        chosen: dict[int, dict[str, BaseAlgorithm]] = {}
+        for i, (agent, model) in enumerate(models.items()):
+            worker = i % n_processes
+            if worker < n_processes - 1 and can_learn_elsewhere(model, loop, tasks[agent]):
+                chosen.setdefault(worker, {})[agent] = model
+        for group in chosen.values():
+            for agent, learner in group.items():
+                # Refused now rather than with some models under way
+                pack(agent, learner)
+        self._workers.start(n_processes - 1)
+        return chosen
