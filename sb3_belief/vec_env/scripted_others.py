@@ -9,69 +9,77 @@ from pettingzoo import ParallelEnv
 
 class ScriptedOthers:
     """
-    What a ``ParallelEnv`` tells of its scripted others: ``scripted_action_spaces`` (name -> space), and after each step
-    ``scripted_actions()`` (name -> what it did in that step). Environments without the two have none.
+    The scripted others of a ``ParallelEnv``.
 
-    :param env: the environment
-    :raises TypeError: if it has one of the two members without the other, or if they are not what they must be
+    An environment declares them by ``scripted_action_spaces`` {name: space}, and its method ``scripted_actions()`` returns
+    {name: action} for the last step. An environment with neither member has no scripted others.
+
+    :param env: The environment
+    :raises TypeError: If it has only one of the two members, or if one of them is of the wrong type
     """
 
     def __init__(self, env: ParallelEnv):
         given = optional_member(env, "scripted_action_spaces")
-        tell = optional_member(env, "scripted_actions")
-        if (given is None) != (tell is None):
-            has, lacks = ("scripted_action_spaces", "scripted_actions()")[:: 1 if tell is None else -1]
+        last_actions = optional_member(env, "scripted_actions")
+        if (given is None) != (last_actions is None):
+            has, lacks = ("scripted_action_spaces", "scripted_actions()")[:: 1 if last_actions is None else -1]
             raise TypeError(
                 f"{type(env.unwrapped).__name__} has {has} but not {lacks}: an environment with scripted others has the"
                 " attribute scripted_action_spaces {name: space} and the method scripted_actions() -> {name: action of the"
                 " last step}; one without them has neither."
             )
-        if given is not None and not (hasattr(given, "items") and callable(tell)):
+        if given is not None and not (hasattr(given, "items") and callable(last_actions)):
             raise TypeError(
                 "scripted_action_spaces must be a dict {name: space} and scripted_actions a method that returns"
-                f" {{name: action}}, got {type(given).__name__} and {type(tell).__name__}."
+                f" {{name: action}}, got {type(given).__name__} and {type(last_actions).__name__}."
             )
         self.action_spaces: dict[str, spaces.Space] = {} if given is None else dict(given.items())
-        self._tell: Any = tell
+        self._last_actions: Any = last_actions
 
     def actions(self) -> np.ndarray:
         """
-        :return: what all of them did in the last step, one after the other as ``gymnasium.spaces.flatten`` codes it, float32
-            [W_scripted]
-        :raises ValueError: if actions are missing, are of nobody or do not fit their spaces
+        Return the actions of the last step, each encoded as by ``gymnasium.spaces.flatten``, side by side.
+
+        :return: float32 ``[W_scripted]``
+        :raises ValueError: If an action is missing, has an unknown name or is not in its space
         """
-        told = self._tell()
-        if told.keys() != self.action_spaces.keys():
-            missing = [name for name in self.action_spaces if name not in told]
-            unknown = [name for name in told if name not in self.action_spaces]
+        actions = self._last_actions()
+        if actions.keys() != self.action_spaces.keys():
+            missing = [name for name in self.action_spaces if name not in actions]
+            unknown = [name for name in actions if name not in self.action_spaces]
             raise ValueError(
                 f"scripted_actions() must return one action for each of {list(self.action_spaces)}: missing {missing},"
                 f" unknown {unknown}."
             )
-        return np.concatenate([_flat(name, space, told[name]) for name, space in self.action_spaces.items()])
+        return np.concatenate([_flat(name, space, actions[name]) for name, space in self.action_spaces.items()])
 
 
 def optional_member(env: ParallelEnv, name: str) -> Any:
     """
-    :param env: the environment, with or without wrappers
-    :param name: of something that it may offer beyond PettingZoo's interface
-    :return: that, or None if it has no such thing
+    Return an attribute or method that an environment may offer beyond PettingZoo's interface.
+
+    :param env: The environment, with or without wrappers
+    :param name: Name of the member
+    :return: The member, or None if the environment has none of that name
     """
-    # Wrappers pass it on, but not the conversions to AEC and back that some of SuperSuit's consist of (e.g. dtype_v0);
-    # silently to lose visibility() there would show agents what they could not see
+    # Wrappers pass members on, but conversions to AEC and back do not, and some of SuperSuit's wrappers consist of such
+    # conversions (e.g. dtype_v0). If visibility() got lost there, agents would observe more than they should
     return getattr(env, name, getattr(env.unwrapped, name, None))
 
 
 def _flat(name: str, space: spaces.Space, action: Any) -> np.ndarray:
     """
-    :param name: of a scripted other
-    :param space: its action space
-    :param action: what it did
-    :return: float32 [flatdim(space)]
+    Flatten one action.
+
+    :param name: Name of the scripted other
+    :param space: Its action space
+    :param action: Its action
+    :return: float32 ``[flatdim(space)]``
+    :raises ValueError: If the action is not in the space
     """
     values = np.asarray(action)
     if isinstance(space, spaces.Box):
-        # As for the agents' own actions, the bounds are the environment's affair
+        # Bounds are not checked: the environment is responsible for the actions that it chooses itself
         fits = values.dtype.kind in "biuf" and values.shape == space.shape
     else:
         fits = values.dtype.kind in "biu" and space.contains(values.astype(np.int64))

@@ -21,33 +21,34 @@ TeamStep: TypeAlias = tuple[TeamObs, np.ndarray, np.ndarray, list[dict[str, Any]
 
 class TeamVecEnv(VecEnv):
     """
-    ``num_envs`` copies of an environment with one team of ``n`` agents, stepped together and reset automatically.
+    Vectorised environment of a team of ``n`` agents: copies that are stepped together and reset automatically.
 
-    A subclass implements ``_reset_joint`` and ``_step_joint``; what every team environment needs besides is here: the check
-    of the actions and the monitoring (episode returns of the team and of each agent, monitor files). After every step
-    ``infos[e]`` holds plain arrays, never dictionaries by agent, because SB3's vectorisers deep-copy infos each step:
+    A subclass implements ``_reset_joint`` and ``_step_joint``. This class does what every team environment needs besides: it
+    checks the actions and monitors episodes (returns of the team and of each agent, monitor files). After every step
+    ``infos[e]`` holds plain arrays, never dictionaries by agent, because SB3's vectorisers deep-copy infos at each step:
 
-    - ``agent_rewards`` float32 [n]
-    - ``visible`` bool [n, n-1+n_scripted]: row i says whose action of this step agent i could observe (the other agents in
+    - ``agent_rewards`` float32 ``[n]``
+    - ``visible`` bool ``[n, n-1+n_scripted]``: row i says whose action of this step agent i could observe (the other agents in
       order, then the scripted others)
-    - ``active`` bool [n]: was in play when it acted
-    - ``life_end`` bool [n]: the agent's own return ended at this step (it terminated, or its life ended)
-    - ``truncated`` bool [n]: the agent's own return was cut by a limit at this step (never together with ``life_end``)
-    - with scripted others only: ``scripted_actions`` float32 [W_scripted]: what they did in this step, one after the other as
-      ``gymnasium.spaces.flatten`` codes it
+    - ``active`` bool ``[n]``: whether the agent was in play when it acted
+    - ``life_end`` bool ``[n]``: whether the agent's own return ended at this step (it terminated, or its life ended)
+    - ``truncated`` bool ``[n]``: whether the agent's own return was cut off by a limit at this step (never together with
+      ``life_end``)
+    - ``scripted_actions`` float32 ``[W_scripted]``, only with scripted others: their actions of this step, each encoded as by
+      ``gymnasium.spaces.flatten``, side by side
 
-    and at the end of the team's episode also ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool,
-    ``is_success`` bool (if the environment says), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
-    and ``agent_episode_rewards`` float64 [n].
+    At the end of the team's episode it also holds ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool,
+    ``is_success`` bool (if the environment reports it), ``episode`` {"r": team return, "l": length, "t": seconds since the
+    start} and ``agent_episode_rewards`` float64 ``[n]``.
 
-    :param num_envs: number of copies
-    :param possible_agents: names of the agents; their order is the order of every array over agents
-    :param observation_spaces: space of each agent's observation (not nested: no ``Dict``, no ``Tuple``)
-    :param action_spaces: space of each agent's action (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``)
-    :param render_mode: render mode of the copies (None, "rgb_array" or "human")
-    :param scripted_action_spaces: action space of each scripted other (a partner that belongs to the environment and does not
-        learn) in order, of the same kinds; None: there are none
-    :raises ValueError: for names or spaces that do not fit
+    :param num_envs: Number of copies
+    :param possible_agents: Names of the agents; their order is the order of every array over agents
+    :param observation_spaces: Observation space of each agent (not nested: no ``Dict``, no ``Tuple``)
+    :param action_spaces: Action space of each agent (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``)
+    :param render_mode: Render mode of the copies (None, "rgb_array" or "human")
+    :param scripted_action_spaces: Action space of each scripted other (a partner that belongs to the environment and does not
+        learn), in order and of the same kinds; None if there are none
+    :raises ValueError: For names or spaces that a team cannot have
     """
 
     def __init__(
@@ -62,11 +63,11 @@ class TeamVecEnv(VecEnv):
         self.possible_agents = list(possible_agents)
         self.scripted_action_spaces = dict(scripted_action_spaces or {})
         check_spaces(self.possible_agents, observation_spaces, action_spaces, self.scripted_action_spaces)
-        # VecEnv.__init__ asks for it through get_attr()
+        # Set first, because VecEnv.__init__ asks for it through get_attr()
         self.render_mode = render_mode
         super().__init__(
             num_envs,
-            # gymnasium may sort the keys: iterate over possible_agents, never over these
+            # Iterate over possible_agents, never over these: gymnasium may sort their keys
             spaces.Dict({agent: observation_spaces[agent] for agent in self.possible_agents}),
             spaces.Dict({agent: action_spaces[agent] for agent in self.possible_agents}),
         )
@@ -84,7 +85,7 @@ class TeamVecEnv(VecEnv):
         """
         Reset all copies, copy i with the seed ``self._seeds[i]`` (None: unseeded) and the options ``self._options[i]``.
 
-        :return: observations, {agent: array [num_envs, ...]}
+        :return: Observations ``[num_envs, ...]`` by agent
         """
 
     @abstractmethod
@@ -92,15 +93,17 @@ class TeamVecEnv(VecEnv):
         """
         Step all copies and reset those whose team episode ended.
 
-        :param actions: {agent: array [num_envs, ...]}, checked
-        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs] and infos
-            as described for the class, less what the monitoring adds (``episode``, ``agent_episode_rewards``); the arrays are
-            new ones each time, since models keep them
+        :param actions: ``[num_envs, ...]`` by agent, already checked
+        :return: Observations ``[num_envs, ...]`` by agent, team rewards float32 ``[num_envs]``, dones bool ``[num_envs]``, and
+            infos as described for the class, without what the monitoring adds (``episode``, ``agent_episode_rewards``). The
+            arrays must be new ones at each step, since models keep them
         """
 
     def action_masks(self) -> dict[str, np.ndarray] | None:
         """
-        :return: which actions are possible now, {agent: bool [num_envs, k]}, or None if the environment has no masks
+        Return the masks for the current observations.
+
+        :return: bool ``[num_envs, k]`` by agent, or None if the environment has no masks
         """
         return None
 
@@ -108,12 +111,14 @@ class TeamVecEnv(VecEnv):
 
     def reset(self) -> TeamObs:
         """
-        :return: first observations of new episodes, {agent: array [num_envs, ...]}
+        Reset all copies.
+
+        :return: First observations of the new episodes, ``[num_envs, ...]`` by agent
         """
         if self.monitor_dir is not None and not self._writers:
             self.start_monitor(self.monitor_dir)
         obs = self._reset_joint()
-        # Seeds and options are only used once
+        # Seeds and options are used only once
         self._reset_seeds()
         self._reset_options()
         self._zero_episode_sums()
@@ -121,14 +126,19 @@ class TeamVecEnv(VecEnv):
 
     def step_async(self, actions: TeamObs) -> None:  # type: ignore[override]
         """
-        :param actions: {agent: array [num_envs, ...]} with an entry for every agent
-        :raises ValueError: if an agent is missing or unknown, or an array has the wrong shape
+        Check the actions of the next step and keep them until ``step_wait``.
+
+        :param actions: ``[num_envs, ...]`` by agent, with an entry for every agent
+        :raises ValueError: If an agent is missing or unknown, or an array has the wrong shape
         """
         self._actions = self._check_actions(actions)
 
     def step_wait(self) -> TeamStep:
         """
-        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs], infos
+        Step all copies with the actions of ``step_async``, and reset those whose team episode ends.
+
+        :return: Observations ``[num_envs, ...]`` by agent, team rewards float32 ``[num_envs]``, dones bool ``[num_envs]`` and
+            infos
         """
         obs, rewards, dones, infos = self._step_joint(self._actions)
         self._monitor_step(rewards, dones, infos)
@@ -136,15 +146,18 @@ class TeamVecEnv(VecEnv):
 
     def step(self, actions: TeamObs) -> TeamStep:  # type: ignore[override]
         """
-        :param actions: {agent: array [num_envs, ...]}
-        :return: observations {agent: array [num_envs, ...]}, team rewards float32 [num_envs], dones bool [num_envs], infos
-        :raises ValueError: if an agent is missing or unknown, or an array has the wrong shape
+        Step all copies, and reset those whose team episode ends.
+
+        :param actions: ``[num_envs, ...]`` by agent, with an entry for every agent
+        :return: Observations ``[num_envs, ...]`` by agent, team rewards float32 ``[num_envs]``, dones bool ``[num_envs]`` and
+            infos
+        :raises ValueError: If an agent is missing or unknown, or an array has the wrong shape
         """
         self.step_async(actions)
         return self.step_wait()
 
     def close(self) -> None:
-        """Close the monitor files; a subclass with resources of its own closes these too."""
+        """Close the monitor files; a subclass that holds other resources closes these too."""
         for writer in self._writers:
             writer.close()
         self._writers = []
@@ -167,22 +180,24 @@ class TeamVecEnv(VecEnv):
     ) -> list[Any]:
         result = getattr(self, method_name)(*method_args, **method_kwargs)
         if method_name == "action_masks":
-            # sb3-contrib's evaluation asks each copy for its masks, and hands what it got to predict()
+            # sb3-contrib's evaluation asks each copy for its masks and passes the answers on to predict()
             return [{agent: masks[i] for agent, masks in (result or {}).items()} for i in self._get_indices(indices)]
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        # The monitoring is built in: evaluate_policy asks before it trusts info["episode"], and may trust it
+        # evaluate_policy asks whether there is a Monitor before it trusts info["episode"]; the monitoring here does the same
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
     # Monitoring
 
     def start_monitor(self, folder: str) -> None:
         """
-        Write from now on one row per finished episode in SB3's monitor format: ``monitor.csv`` for the team and
-        ``agents/<agent>.monitor.csv`` for each agent's own return. Existing files are overwritten.
+        Start writing one row per finished episode in SB3's monitor format.
 
-        :param folder: where the files go; it is created if need be
+        ``monitor.csv`` holds the team's returns and ``agents/<agent>.monitor.csv`` each agent's own. Existing files are
+        overwritten.
+
+        :param folder: Folder of the files; it is created if it does not exist
         """
         for writer in self._writers:
             writer.close()
@@ -198,6 +213,7 @@ class TeamVecEnv(VecEnv):
         self._lengths = np.zeros(self.num_envs, dtype=int)
 
     def _monitor_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Add a step to the episodes' returns, and where an episode has ended, put them into its info and into the files."""
         self._team_returns += rewards
         self._agent_returns += np.concatenate([info["agent_rewards"] for info in infos]).reshape(self._agent_returns.shape)
         self._lengths += 1
@@ -208,7 +224,7 @@ class TeamVecEnv(VecEnv):
             info["episode"] = {"r": team_return, "l": length, "t": seconds}
             info["agent_episode_rewards"] = self._agent_returns[env_idx].copy()
             if self._writers:
-                # An empty cell where the environment does not tell successes
+                # The cell stays empty where the environment reports no successes
                 row = {"l": length, "t": seconds, "is_success": info.get("is_success", "")}
                 for writer, value in zip(self._writers, [team_return, *info["agent_episode_rewards"]], strict=True):
                     writer.write_row({"r": round(float(value), 6), **row})
@@ -219,6 +235,7 @@ class TeamVecEnv(VecEnv):
     # Checks
 
     def _check_actions(self, actions: Any) -> TeamObs:
+        """Return the actions as arrays in the order of ``possible_agents``."""
         if not isinstance(actions, Mapping):
             raise ValueError(
                 f"A team's actions are a dict {{agent: array [{self.num_envs}, ...]}} with the agents"
