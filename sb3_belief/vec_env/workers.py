@@ -1,9 +1,9 @@
 """
-Copies of a team environment in worker processes: SB3's ``SubprocVecEnv``, whose steps come back as rows of bytes.
+Copies of a team environment in worker processes: SB3's ``SubprocVecEnv``, with each step sent back as one row of bytes.
 
-What a step is made of has the same shape at all steps, so a worker packs it into one row, and here the rows of all copies are
-one array. To pickle a step's dictionaries, arrays and records one by one, and to stack them again, took most of the time that
-workers cost.
+The results of a step have the same shapes and types at every step. A worker therefore packs them into one row of a structured
+array, and the main process reads the rows of all copies as a single array. Pickling a step's dictionaries, arrays and records
+one by one and stacking them again took most of the time that workers cost.
 """
 
 import pickle
@@ -22,10 +22,10 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 from sb3_belief.common.processes import Inbox, leave_interrupts_to_main, start_context
 from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
 
-# What a message with a step's actions begins with; all others are pickles, which do not begin so
+# Messages with a step's actions begin with this byte; all other messages are pickles, which begin with another one
 _STEP = b"s"
-# The parts of a row that are entries of infos, in the order in which ``TeamVecEnv`` lists them
-_INFOS = ("agent_rewards", "visible", "active", "life_end", "truncated")
+# Fields of a row that become entries of infos; step_wait() relies on agent_rewards being the first
+_INFO_FIELDS = ("agent_rewards", "visible", "active", "life_end", "truncated")
 
 
 def row_type(
@@ -34,10 +34,12 @@ def row_type(
     scripted_action_spaces: dict[str, spaces.Space],
 ) -> np.dtype:
     """
-    :param observation_spaces: by agent
-    :param action_spaces: by agent
-    :param scripted_action_spaces: by name of a scripted other
-    :return: what a joint step of one copy is made of; observations are named by the agent's number
+    Return the structured type of a row, which holds a joint step of one copy.
+
+    :param observation_spaces: Observation space of each agent
+    :param action_spaces: Action space of each agent
+    :param scripted_action_spaces: Action space of each scripted other
+    :return: The type; in ``observations``, the field of an agent has its number as its name
     """
     n = len(observation_spaces)
     observations = [(str(i), space.dtype, space.shape or ()) for i, space in enumerate(observation_spaces.values())]
@@ -58,20 +60,21 @@ def row_type(
 
 class WorkersVecEnv(SubprocVecEnv):
     """
-    SB3's ``SubprocVecEnv`` for joint environments, with other messages for the steps. Its workers leave Ctrl-C to the main
-    process.
+    SB3's ``SubprocVecEnv`` for joint environments, with its own messages for steps.
 
-    :param env_fns: one callable per copy that makes its ``JointEnv``
+    The workers leave Ctrl-C to the main process.
+
+    :param env_fns: One callable for each copy, which makes its ``JointEnv``
     """
 
-    # Of the last step: float32 [num_envs, n]
+    # Rewards of the last step, float32 [num_envs, n]
     agent_rewards: np.ndarray
-    # For the next one: bool [num_envs, sum of their widths], all agents' one after the other; None if there are none
+    # Masks for the next actions, those of all agents side by side, bool [num_envs, sum of their widths]; None without masks
     action_masks: np.ndarray | None = None
 
     def __init__(self, env_fns: list[Callable[[], JointEnv]]):
         self.waiting = self.closed = False
-        # As SB3 starts its own workers: with another target, so its constructor is not called
+        # SB3's constructor is not called, because it would start its own function in the workers. Otherwise this does the same
         context = start_context()
         self.remotes, self.work_remotes = zip(*[context.Pipe() for _ in env_fns], strict=True)
         self.processes = []
@@ -93,22 +96,26 @@ class WorkersVecEnv(SubprocVecEnv):
         scripted_action_spaces: dict[str, spaces.Space],
     ) -> None:
         """
-        :param observation_spaces: by agent, the same in all copies
-        :param action_spaces: by agent
-        :param scripted_action_spaces: by name of a scripted other
+        Set agents and spaces, once they are known to be the same in all copies.
+
+        :param observation_spaces: Observation space of each agent
+        :param action_spaces: Action space of each agent
+        :param scripted_action_spaces: Action space of each scripted other
         """
         self._agents = list(observation_spaces)
         self._row_type = row_type(observation_spaces, action_spaces, scripted_action_spaces)
-        self._info_names = _INFOS + ("scripted_actions",) * bool(scripted_action_spaces)
+        self._info_names = _INFO_FIELDS + ("scripted_actions",) * bool(scripted_action_spaces)
 
     def step(self, actions: Any) -> VecEnvStepReturn:
         """
-        Step all copies. Ctrl-C can interrupt the waiting, never a message: an interrupted step is finished before the next
-        one.
+        Step all copies.
+
+        Ctrl-C can interrupt the wait for the workers, but not the transfer of a message. An interrupted step is finished
+        before the next command is sent.
 
         :param actions: For each copy, the actions by agent
-        :return: As :meth:`step_wait`
-        :raises RuntimeError: If a worker died
+        :return: As for :meth:`step_wait`
+        :raises RuntimeError: If a worker has died
         """
         self.finish_step()
         with self._reports_deaths("step"):
@@ -119,14 +126,14 @@ class WorkersVecEnv(SubprocVecEnv):
                 return self.step_wait()
 
     def finish_step(self) -> None:
-        """Receive the results of a step that was interrupted, and drop them."""
+        """Receive and discard the results of an interrupted step, if there is one."""
         if self.waiting:
             with self._reports_deaths("step"):
                 self._await_steps()
                 self.step_wait()
 
     def _await_steps(self) -> None:
-        # The last to start is likely the last to finish: waiting for it first means being woken once
+        # The last worker to start is likely the last to finish, so waiting for it first wakes this process only once
         for inbox in reversed(self.inboxes):
             inbox.wait()
 
@@ -139,29 +146,25 @@ class WorkersVecEnv(SubprocVecEnv):
         self.finish_step()
         super().close()
 
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+    def _get_target_remotes(self, indices: VecEnvIndices) -> list[Any]:
+        # SB3 calls this before each command to the environments (get_attr, env_method, ...), so none of them receives the
+        # results of an interrupted step in place of its own
         self.finish_step()
-        return super().get_attr(attr_name, indices)
-
-    def has_attr(self, attr_name: str) -> bool:
-        self.finish_step()
-        return super().has_attr(attr_name)
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        self.finish_step()
-        return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+        return super()._get_target_remotes(indices)
 
     @contextmanager
     def _reports_deaths(self, doing: str) -> Iterator[None]:
-        """Say which worker died within the block, and end the others."""
+        """
+        If a worker dies within the block, end the others and say which one it was.
+
+        :param doing: Name of the method, for the message
+        """
         try:
             yield
         except (EOFError, OSError) as error:
             if self.closed:
                 raise RuntimeError(f"Cannot {doing}: the environment is closed, its worker processes have ended.") from error
-            # A process that has closed its pipe may need a moment to end
+            # A process that has closed its pipe may take a moment to end
             for process in self.processes:
                 process.join(0.1)
             dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes) if not p.is_alive()]
@@ -181,7 +184,9 @@ class WorkersVecEnv(SubprocVecEnv):
 
     def step_async(self, actions: Any) -> None:
         """
-        :param actions: of each copy, {agent: action}
+        Send the actions to the workers.
+
+        :param actions: For each copy, the actions by agent
         """
         for remote, chosen in zip(self.remotes, actions, strict=True):
             remote.send_bytes(_STEP + pickle.dumps(tuple(chosen.values())))
@@ -189,18 +194,21 @@ class WorkersVecEnv(SubprocVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :return: observations {agent: array [num_envs, ...]}, rewards float32 [num_envs], dones bool [num_envs] and infos as
-            a ``TeamVecEnv`` has them
+        Receive the results of a step from all workers.
+
+        :return: Observations ``[num_envs, ...]`` by agent, rewards float32 ``[num_envs]``, dones bool ``[num_envs]`` and infos
+            as those of a ``TeamVecEnv``
         """
         messages = [remote.recv_bytes() for remote in self.remotes]
         self.waiting = False
         size = self._row_type.itemsize
         rows = np.frombuffer(b"".join([message[:size] for message in messages]), dtype=self._row_type)
-        # Copies, since rows are read-only and would be kept as a whole by whoever keeps a part
+        # Copies, since rows are read-only, and whoever kept a view of one field would keep the whole array alive
         observations = {agent: rows["observations"][str(i)].copy() for i, agent in enumerate(self._agents)}
         columns = [rows[name].copy() for name in self._info_names]
         self.agent_rewards = columns[0]
-        infos = [dict(zip(self._info_names, parts, strict=True)) for parts in zip(*columns, strict=True)]
+        infos = [dict(zip(self._info_names, entries, strict=True)) for entries in zip(*columns, strict=True)]
+        # A worker appends a pickle to its row where the infos hold more, as they do at the end of an episode
         for info, message in zip(infos, messages, strict=True):
             if len(message) > size:
                 info.update(pickle.loads(message[size:]))
@@ -210,47 +218,49 @@ class WorkersVecEnv(SubprocVecEnv):
 
 class PackedSteps:
     """
-    Steps a copy in its worker.
+    Steps of one copy in its worker, each packed into a row.
 
-    :param env: the copy
+    :param env: The copy
     """
 
     def __init__(self, env: JointEnv):
         self._env = env
         dtype = row_type(env.observation_spaces, env.action_spaces, env.scripted_action_spaces)
         self._row = np.zeros((), dtype=dtype)
-        # Views of the row, to be filled
+        # Views of the row, made once: each step writes into them
         self._observations = [(agent, self._row["observations"][str(i)]) for i, agent in enumerate(env.observation_spaces)]
-        self._parts = {name: self._row[name] for name in dtype.names or ()}
+        self._fields = {name: self._row[name] for name in dtype.names or ()}
 
     def __call__(self, actions: tuple[Any, ...]) -> bytes:
         """
-        :param actions: of the agents, in order
-        :return: the row, with the observations and masks of the new episode if one has ended, and if the infos hold anything
-            else, that as a pickle
+        Step the copy, and reset it if its episode ends.
+
+        :param actions: Actions of the agents, in order
+        :return: The row, followed by a pickle of what the infos hold that has no field in it, if anything. Where an episode
+            has ended, observations and masks are those of the new one
         """
-        parts = self._parts
+        fields = self._fields
         joint_action = dict(zip(self._env.possible_agents, actions, strict=True))
         obs, reward, done, record, masks, others = step_and_reset(self._env, joint_action)
-        for agent, part in self._observations:
-            part[...] = obs[agent]
-        parts["reward"][...], parts["done"][...] = reward, done
-        parts["agent_rewards"][...], parts["visible"][...] = record.agent_rewards, record.visible
-        parts["active"][...], parts["life_end"][...], parts["truncated"][...] = record.flags
+        for agent, field in self._observations:
+            field[...] = obs[agent]
+        fields["reward"][...], fields["done"][...] = reward, done
+        fields["agent_rewards"][...], fields["visible"][...] = record.agent_rewards, record.visible
+        fields["active"][...], fields["life_end"][...], fields["truncated"][...] = record.flags
         if record.scripted_actions is not None:
-            parts["scripted_actions"][...] = record.scripted_actions
-        parts["has_masks"][...] = masks is not None
+            fields["scripted_actions"][...] = record.scripted_actions
+        fields["has_masks"][...] = masks is not None
         if masks is not None:
-            parts["action_masks"][...] = masks
+            fields["action_masks"][...] = masks
         return self._row.tobytes() + pickle.dumps(others) if others else self._row.tobytes()
 
 
 class _Channel:
     """
-    A worker's end of its pipe as SB3's worker loop knows it. Steps are answered here, all other commands are left to that.
+    Connection to the main process that answers the commands to step, and passes all others to SB3's worker loop.
 
-    :param connection: the end itself
-    :param env: the worker's copy
+    :param connection: The worker's end of its pipe
+    :param env: The worker's copy
     """
 
     def __init__(self, connection: Connection, env: JointEnv):
@@ -260,10 +270,12 @@ class _Channel:
 
     def recv(self) -> Any:
         """
-        :return: the next command that is no step
+        Answer commands to step until another command arrives.
+
+        :return: That command
         """
         while (message := self._connection.recv_bytes()).startswith(_STEP):
-            # Made at the first step: by then the main process has seen that a team can have these spaces
+            # Made at the first step: by then the main process has checked that a team can have these spaces
             self._steps = self._steps or PackedSteps(self._env)
             self._connection.send_bytes(self._steps(pickle.loads(message[len(_STEP) :])))
         return pickle.loads(message)
@@ -271,15 +283,15 @@ class _Channel:
 
 def _serve(connection: Connection, parent_end: Connection, env_fn: CloudpickleWrapper) -> None:
     """
-    What a worker process does until its pipe is closed.
+    Run a worker process until its pipe is closed.
 
-    :param connection: its end of the pipe
-    :param parent_end: the other end
-    :param env_fn: makes its copy
+    :param connection: The worker's end of the pipe
+    :param parent_end: The main process's end of the pipe
+    :param env_fn: Makes the worker's copy
     """
-    # SB3's loop would end and the environment with it
+    # At Ctrl-C SB3's loop would end, and the environment with it
     leave_interrupts_to_main()
-    # Before the environment, which may start processes of its own
+    # Closed before the environment is made, since processes that it starts would inherit this end
     parent_end.close()
     env = env_fn.var()
     channel: Any = _Channel(connection, env)
@@ -288,7 +300,7 @@ def _serve(connection: Connection, parent_end: Connection, env_fn: CloudpickleWr
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block, where the system can."""
+    """Delay Ctrl-C until the end of the block, on systems that can."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
