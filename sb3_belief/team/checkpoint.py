@@ -1,6 +1,6 @@
 """
-The file of a saved team: one zip with ``team.json`` and, for each agent, ``agents/<agent>.zip`` (a normal SB3 zip, which loads
-and predicts alone) and, if it is normalised, ``agents/<agent>.vecnormalize.pkl`` (what ``VecNormalize.save`` writes).
+The file of a saved team: a zip with ``team.json`` and ``agents/<agent>.zip`` for each agent, a normal SB3 zip that loads and
+predicts alone. A normalised agent also has ``agents/<agent>.vecnormalize.pkl``, as written by ``VecNormalize.save``.
 """
 
 import io
@@ -21,17 +21,18 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_belief.common.versions import versions
 
+# Version of the layout above
 FORMAT = 1
 
 
 @dataclass
 class SavedTeam:
     """
-    A team as it stands in a file.
+    The contents of a team's file.
 
-    :param manifest: what ``team.json`` says
-    :param models: {agent: bytes of its SB3 zip}
-    :param statistics: {agent: its normalisation}, without an environment
+    :param manifest: The contents of ``team.json``
+    :param models: The bytes of the agents' SB3 zips, by agent
+    :param statistics: Normalisation of the agents that have one, by agent, without an environment
     """
 
     manifest: dict[str, Any]
@@ -40,9 +41,11 @@ class SavedTeam:
 
     def algo_class(self, agent: str) -> type[BaseAlgorithm]:
         """
-        :param agent: name of the agent
-        :return: class of its model
-        :raises ValueError: if there is no such class here
+        Import the class of an agent's model.
+
+        :param agent: Name of the agent
+        :return: The class
+        :raises ValueError: If it cannot be imported, or is not an SB3 algorithm
         """
         name = str(self.manifest["classes"][agent])
         module, _, qualname = name.partition(":")
@@ -58,17 +61,18 @@ class SavedTeam:
 
     @property
     def scripted(self) -> dict[str, str]:
-        """
-        :return: {name of a scripted other: its action space in words}, in order; files that tell nothing of them had none
-        """
+        """The action spaces of the scripted others as text, {name: space}, in order."""
+        # Files from before scripted others existed do not have the entry
         return self.manifest.get("scripted_action_spaces", {})
 
     def check_env(self, env: VecEnv, agents: list[str], scripted: dict[str, str]) -> None:
         """
-        :param env: the environment that the team is to have
-        :param agents: its agents
-        :param scripted: its scripted others and their action spaces in words, in order
-        :raises ValueError: if agents, scripted others or spaces differ, saying how
+        Check that an environment fits the saved team.
+
+        :param env: The environment
+        :param agents: Names of its agents
+        :param scripted: Action spaces of its scripted others as text, by name and in order
+        :raises ValueError: If agents, scripted others or spaces differ; the message says how
         """
         saved_agents = list(self.manifest["agents"])
         if saved_agents != agents:
@@ -92,12 +96,14 @@ def write_team(
     manifest: dict[str, Any],
 ) -> None:
     """
-    Write a team's file at once: a file already there stays whole until the new one is.
+    Write a team's file.
 
-    :param path: where to (".zip" is added to a name without a suffix), or an open binary file
-    :param models: {agent: model}
-    :param statistics: {agent: normalisation} of the agents that have one
-    :param manifest: what goes into ``team.json`` besides the classes and versions
+    An existing file is replaced only when the new one is complete.
+
+    :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
+    :param models: Models by agent
+    :param statistics: Normalisation of the agents that have one, by agent
+    :param manifest: Entries of ``team.json`` besides the format, agents, classes and versions
     """
     classes = {agent: f"{type(model).__module__}:{type(model).__qualname__}" for agent, model in models.items()}
     manifest = {"format": FORMAT, "agents": list(models), "classes": classes, **manifest, "versions": versions()}
@@ -112,7 +118,7 @@ def write_team(
     try:
         with os.fdopen(descriptor, "wb") as file:
             _write_archive(file, models, statistics, manifest)
-        # mkstemp makes files that only their owner may read
+        # mkstemp() makes files that only their owner may read
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, target)
     except BaseException:
@@ -122,10 +128,12 @@ def write_team(
 
 def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
     """
-    :param path: of the file, with or without ".zip", or an open binary file
-    :return: what it holds
-    :raises FileNotFoundError: if there is none
-    :raises ValueError: if it is not a whole file of a saved team
+    Read a team's file.
+
+    :param path: Path of the file, with or without ".zip", or an open binary file
+    :return: Its contents
+    :raises FileNotFoundError: If there is no such file
+    :raises ValueError: If it is not the file of a saved team, or is damaged
     """
     if not isinstance(path, io.BufferedIOBase):
         path = pathlib.Path(path)
@@ -155,11 +163,13 @@ def spaces_manifest(
     observation_space: spaces.Dict, action_space: spaces.Dict, agents: list[str], scripted: dict[str, str]
 ) -> dict[str, Any]:
     """
-    :param observation_space: of the team
-    :param action_space: of the team
-    :param agents: names of the agents
-    :param scripted: the scripted others and their action spaces in words, in order
-    :return: the entries of ``team.json`` that ``SavedTeam.check_env`` compares with
+    Describe the team's spaces for ``team.json``.
+
+    :param observation_space: Observation space of the team
+    :param action_space: Action space of the team
+    :param agents: Names of the agents
+    :param scripted: Action spaces of the scripted others as text, by name and in order
+    :return: The entries that ``SavedTeam.check_env`` compares with
     """
     return {
         "observation_spaces": {agent: str(observation_space[agent]) for agent in agents},
@@ -171,7 +181,8 @@ def spaces_manifest(
 def _write_archive(
     file: Any, models: dict[str, BaseAlgorithm], statistics: dict[str, VecNormalize], manifest: dict[str, Any]
 ) -> None:
-    # Compressed, although weights hardly get smaller: else a file cut off after an agent's zip would pass for a whole one
+    # Compressed, although weights hardly shrink: if the agents' zips were stored as they are, a file cut off after one of them
+    # would end as a complete zip does, and be read as the zip of that agent
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("team.json", json.dumps(manifest, indent=2))
         for agent, model in models.items():
@@ -183,7 +194,7 @@ def _write_archive(
 
 
 def _umask() -> int:
-    # There is no other way to read it
+    # It can only be read by setting it
     umask = os.umask(0)
     os.umask(umask)
     return umask

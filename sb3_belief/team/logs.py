@@ -1,4 +1,4 @@
-"""Logging of a team: each agent's own series in files, and one table per iteration for all."""
+"""Logging of a team: each agent's own values go to files, and their means into one table per iteration."""
 
 import os
 import sys
@@ -14,18 +14,19 @@ from stable_baselines3.common.utils import get_latest_run_id
 
 def _has_spread(key: str) -> bool:
     """
-    :param key: of a logged value
-    :return: whether the agents' standard deviation says something besides their mean
+    Return whether the standard deviation over the agents is logged besides their mean.
+
+    :param key: Key of a logged value
     """
     return key in ("rollout/ep_rew_mean", "train/approx_kl") or key.startswith("belief/")
 
 
-class _Relay(KVWriter):
+class _LatestValues(KVWriter):
     """
-    Keeps what an agent has dumped last.
+    Writer that hands the values of an agent's logger to the team's log, which keeps the latest.
 
-    :param agent: name of the agent
-    :param log: where it goes
+    :param agent: Name of the agent
+    :param log: The team's log
     """
 
     def __init__(self, agent: str, log: "TeamLog"):
@@ -36,21 +37,22 @@ class _Relay(KVWriter):
         self._log.excluded.update(key_excluded)
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing: no file is open."""
 
 
 class TeamLog:
     """
     The loggers of a team and of its agents.
 
-    :param agents: names of the agents
-    :param verbose: 1 and more: the team's table goes to the standard output
-    :param log_dir: folder of ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None: no CSV files
-    :param tensorboard_log: folder of the TensorBoard runs: ``Team_<k>`` (the team) and ``Team_<k>/agents/<agent>``; None: none
+    :param agents: Names of the agents
+    :param verbose: 1 or more prints the team's table to the standard output
+    :param log_dir: Folder for ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV files
+    :param tensorboard_log: Folder for the TensorBoard runs ``Team_<k>`` (the team) and ``Team_<k>/agents/<agent>``; None for
+        none
     """
 
     def __init__(self, agents: Sequence[str], verbose: int, log_dir: str | None, tensorboard_log: str | None):
-        # What each agent has dumped since the last table, and which outputs do not take a key
+        # Values that each agent has dumped since the last table, and the outputs from which each key is excluded
         self.latest: dict[str, dict[str, Any]] = {}
         self.excluded: dict[str, tuple[str, ...]] = {}
         run_dir = None
@@ -68,33 +70,36 @@ class TeamLog:
 
     def connect(self, agent: str, model: BaseAlgorithm) -> None:
         """
-        Give an agent its logger; one that the user has set stays, and is listened to.
+        Give an agent its logger, and have its values reach the team's table.
 
-        :param agent: name of the agent
-        :param model: its model
+        A logger that the user has set on the model stays; its values reach the table too.
+
+        :param agent: Name of the agent
+        :param model: Its model
         """
         if not model._custom_logger:
             model.set_logger(self.agent_loggers[agent])
-        model.logger.output_formats.append(_Relay(agent, self))
+        model.logger.output_formats.append(_LatestValues(agent, self))
 
     def complete(self, learning: Iterable[str]) -> bool:
         """
-        :param learning: who still learns
-        :return: whether there is something new, and of each of these
+        Return whether the agents have dumped what the next table needs.
+
+        :param learning: Names of the agents that are still learning
+        :return: Whether each of them, and at least one agent, has dumped values since the last table
         """
         return bool(self.latest) and set(learning) <= self.latest.keys()
 
     def record_means(self, logger: Logger) -> None:
         """
-        Record the means over the agents of what they have dumped since the last time, and standard deviations where these
-        say something.
+        Record the means over the agents of the values dumped since the last table, for some also the standard deviations.
 
-        :param logger: of the team
+        :param logger: Logger of the team
         """
         values: dict[str, list[float]] = {}
         for dumped in self.latest.values():
             for key, value in dumped.items():
-                # Times are the team's own; images, texts and the like stay in the agents' own logs
+                # The team records times itself; images, texts and the like are only in the agents' own logs
                 if isinstance(value, (Number, np.number)) and not key.startswith("time/"):
                     values.setdefault(key, []).append(float(value))  # type: ignore[arg-type]
         for key, numbers in values.items():
@@ -105,7 +110,7 @@ class TeamLog:
         self.latest.clear()
 
     def close(self) -> None:
-        """Close the files; the standard output stays open."""
+        """Close the files, but not the standard output."""
         for logger in [self.team_logger, *self.agent_loggers.values()]:
             logger.close()
 
