@@ -1,4 +1,4 @@
-"""One learner among partners that act and do not learn."""
+"""A single learner in a team whose other agents act and do not learn."""
 
 from sb3_belief.team.fixed_partners.agent_env import AgentEnv
 

@@ -20,44 +20,45 @@ from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 
 class AgentEnv(gym.Env):
     """
-    What one learner meets in a team of fixed partners: to learn with any SB3 algorithm alone, to adapt to new partners.
+    Gymnasium environment of a single learner in a team of fixed partners.
 
-    The learner gets exactly what it would get in a ``Team``: its observation, its reward, and in ``info`` of a step
-    ``others_actions`` float32 [W] (zero where not visible), ``others_visible`` bool [n_others] and ``active`` bool, at the end
-    of the team's episode also ``is_success`` if the environment tells it. The others stand in the order of
-    ``possible_agents`` without the learner, scripted others of the environment after them. ``action_masks()`` is there where
-    the environment gives the learner masks.
+    Any SB3 algorithm can learn in it, for instance to adapt to new partners. The learner gets exactly what it would get in a
+    ``Team``: its observation, its reward, and in the info of a step ``others_actions`` float32 ``[W]`` (zero where not
+    visible), ``others_visible`` bool ``[n_others]`` and ``active`` bool; at the end of the team's episode also ``is_success``
+    if the environment reports it. The others are in the order of ``possible_agents`` without the learner, followed by the
+    environment's scripted others. ``action_masks()`` exists where the environment gives the learner masks.
 
-    ``terminated`` and ``truncated`` are those of the learner's own return. Where it ends before the team's episode does, and
-    the learner stays (``life_end``), the next ``reset()`` without seed and options goes on with that episode, as SB3's
-    ``EpisodicLifeEnv`` does; a learner that has left for good does not wait: the partners play the rest of the episode within
-    the step at which it leaves. Steps at which it is listed but out of play have ``active=False``.
+    ``terminated`` and ``truncated`` describe the learner's own return. If it ends before the team's episode does and the
+    learner stays (``life_end``), the next ``reset()`` without seed and options continues that episode, as SB3's
+    ``EpisodicLifeEnv`` does. If the learner has left for good, the partners play the rest of the episode within the step in
+    which it leaves. Steps in which it is still listed but out of play have ``active=False``.
 
     A partner is one of
 
-    - an SB3 model; if it is normalised by ``VecNormalize``, its observations are too
-    - the path of an SB3 zip, or of a saved team (then the agent of the same name acts; ``"team.zip:agent_0"`` takes another)
+    - an SB3 model; if ``VecNormalize`` normalises its observations, they are normalised here too
+    - the path of an SB3 zip, or of a saved team (whose agent of the same name acts; ``"team.zip:agent_0"`` chooses another)
     - an object with SB3's ``predict(obs, state, episode_start, deterministic)``
     - a callable ``obs -> action``
 
-    which is also given ``action_masks`` if it has such an argument (None where the environment has no masks for it).
+    A partner that has an argument ``action_masks`` is also given its masks (None if the environment has no masks for it).
 
-    Each partner draws from a random stream of its own, seeded by ``reset(seed)``, so that the learner's does not depend on it.
-    Worker processes (``SubprocVecEnv``) can be given paths and importable functions, but not every model.
+    Each partner has random number generators of its own, seeded by ``reset(seed)``, so that the learner's random numbers do
+    not depend on its partners. Worker processes (``SubprocVecEnv``) can be given paths and importable functions, but not every
+    model.
 
-    :param parallel_env: an id (see ``make_team_env``), a callable that makes a PettingZoo ``ParallelEnv``, or such an
+    :param parallel_env: An id (see ``make_team_env``), a callable that makes a PettingZoo ``ParallelEnv``, or such an
         environment
-    :param agent: name of the learner
-    :param partners: {agent: partner} for all the others; or the path of a saved team, for all of them
-    :param env_kwargs: keyword arguments of the environment, for an id or a callable
-    :param visibility: as for ``make_team_env``
-    :param deterministic: partners that predict take their most likely actions; False: they sample, as when they learned
-    :param render_mode: of the environment, for an id or a callable
-    :raises TypeError: for what is no environment or no partner
-    :raises ValueError: for an unknown agent, agents without a partner, or partners that do not fit
+    :param agent: Name of the learner
+    :param partners: Partners of all other agents, by agent, or the path of a saved team from which all of them are taken
+    :param env_kwargs: Keyword arguments of the environment, for an id or a callable
+    :param visibility: As for ``make_team_env``
+    :param deterministic: Whether partners with a ``predict`` take their most likely actions; False samples, as in training
+    :param render_mode: Render mode of the environment, for an id or a callable
+    :raises TypeError: If the environment or a partner is of an unsuitable type
+    :raises ValueError: For an unknown agent, agents without a partner, or partners that do not fit
     """
 
-    # Those that gymnasium.make() may ask for; a made environment has its own
+    # gymnasium.make() reads the render modes from the class; an instance has the metadata of its own environment
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 (as gymnasium has it)
 
     def __init__(
@@ -82,7 +83,7 @@ class AgentEnv(gym.Env):
         #: The environment of the team
         self.parallel_env = joint.env
         self.observation_space = joint.observation_spaces[agent]
-        # A copy: a model seeds its action space and samples from it
+        # A copy, since a model seeds its action space and samples from it
         self.action_space = deepcopy(joint.action_spaces[agent])
         self.metadata, self.render_mode = joint.metadata, joint.render_mode
         self.others_action_spaces: dict[str, spaces.Space] = {
@@ -90,42 +91,46 @@ class AgentEnv(gym.Env):
         } | joint.scripted_action_spaces
 
         self._joint, self._agents, self._deterministic = joint, agents, deterministic
+        self._others = [name for name in agents if name != agent]
         self._splitter = TransitionSplitter(agents, joint.action_spaces, joint.scripted_action_spaces)
         self._callers_rng = CallersRng(0)
         self._seed: int | None = None
         self._partners: dict[str, Partner] = {}
         self._obs: dict[str, np.ndarray] = {}
         self._ended: dict[str, bool] = {}
-        # Whether step() may be called, and whether reset() is to go on from a done
-        self._playing, self._pending = False, False
-        others = [name for name in agents if name != agent]
+        # Whether an episode of the learner is running, so that step() may be called
+        self._running = False
+        # Whether the first observation of the learner's next episode is there already. It is after a done: either the
+        # vectorised environment has reset itself, or the team's episode continues
+        self._next_is_ready = False
         if isinstance(partners, (str, os.PathLike)):
-            partners = dict.fromkeys(others, partners)
+            partners = dict.fromkeys(self._others, partners)
         if not isinstance(partners, Mapping):
             raise TypeError(
                 f"partners must be a dict {{agent: partner}} or the path of a team, not {type(partners).__name__}."
             )
-        missing = [name for name in others if name not in partners]
+        missing = [name for name in self._others if name not in partners]
         if missing:
             raise ValueError(
-                f"{missing} of this environment have no partner to act for them: partners must name each of {others}."
+                f"{missing} of this environment have no partner to act for them: partners must name each of {self._others}."
             )
         for name, partner in partners.items():
             self.set_partner(name, partner)
 
     def set_partner(self, name: str, partner: PartnerLike) -> None:
         """
-        Let another partner act from the next step on; ``vec_env.env_method("set_partner", name, partner)`` in all copies.
+        Replace a partner from the next step on.
 
-        :param name: for whom it acts
-        :param partner: see the class
-        :raises TypeError: if it cannot act
-        :raises ValueError: if it does not fit, or for a name that is not a partner's
+        ``vec_env.env_method("set_partner", name, partner)`` does so in all copies.
+
+        :param name: Name of the agent for which it acts
+        :param partner: The new partner, see the class
+        :raises TypeError: If it cannot act
+        :raises ValueError: If it does not fit, or if no partner acts for an agent of that name
         """
-        others = [other for other in self._agents if other != self.agent]
-        if name not in others:
+        if name not in self._others:
             why = "the learner" if name == self.agent else "not an agent that a partner acts for"
-            raise ValueError(f"{name!r} is {why}; partners act for {others}.")
+            raise ValueError(f"{name!r} is {why}; partners act for {self._others}.")
         self._partners[name] = Partner(
             name,
             partner,
@@ -137,62 +142,68 @@ class AgentEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param seed: of the environment and of the partners' random numbers, None: they go on
-        :param options: handed to the environment
-        :return: the learner's observation and an empty info
+        Begin an episode of the learner.
+
+        :param seed: Seed of the environment and of the partners' random numbers; None continues with their generators as they
+            are
+        :param options: Passed on to the environment
+        :return: The learner's observation and an empty info
         """
         super().reset(seed=seed)
-        if seed is not None or options or not self._pending:
+        if seed is not None or options or not self._next_is_ready:
             if seed is not None:
                 self._seed = seed
                 self._team_env.seed(seed)
             if options:
                 self._team_env.set_options(options)
             for name, partner in self._partners.items():
-                partner.start_anew(None if seed is None else self._seed_of(name))
+                partner.reset(None if seed is None else self._seed_of(name))
             self._obs = self._team_env.reset()
             self._ended = dict.fromkeys(self._agents, True)
-        self._playing, self._pending = True, False
+        self._running, self._next_is_ready = True, False
         return self._obs[self.agent][0], {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
-        :param action: of the learner
-        :return: the learner's observation and reward, whether its return ended and whether it was cut, and info
-        :raises RuntimeError: before ``reset()``
+        Step the team, with actions of the partners for the other agents.
+
+        :param action: The learner's action
+        :return: The learner's observation and reward, whether its return terminated, whether it was truncated, and the info
+        :raises RuntimeError: If called before ``reset()``
         """
-        if not self._playing:
+        if not self._running:
             raise RuntimeError(f"The episode of {self.agent!r} is over, or none has begun: call reset() first.")
         team_over, (observations, rewards, dones, infos) = self._step_team(action)
         obs, info = observations[0], infos[0]
         terminated = truncated = False
         if dones[0]:
-            # Vectorised environments add these by themselves
+            # Removed from the info, because a vectorised environment around this one adds its own
             obs, truncated = np.asarray(info.pop("terminal_observation"))[()], info.pop("TimeLimit.truncated")
             terminated = not truncated
             info.pop("episode", None)
             if not team_over and self.agent not in self.parallel_env.agents:
                 info.update(self._play_to_the_end(action))
-            self._playing, self._pending = False, True
+            self._running, self._next_is_ready = False, True
         return obs, float(rewards[0]), terminated, truncated, info
 
     @property
     def action_masks(self) -> Callable[[], np.ndarray]:
         """
-        The method ``action_masks()``: which actions of the learner are possible now, bool [k]. Like an attribute that is not
-        there where the environment gives it no masks, since that is how sb3-contrib finds out.
+        The method ``action_masks()``, which returns the learner's possible actions, bool ``[k]``.
+
+        The attribute does not exist where the environment gives the learner no masks, since that is what sb3-contrib looks at.
+
+        :raises AttributeError: If there are no masks
         """
-        if not self._playing and not self._pending:
-            # Whether there are masks shows at a reset, and sb3-contrib's evaluation asks before its own
+        if not self._running and not self._next_is_ready:
+            # Whether there are masks is known only after a reset, and sb3-contrib's evaluation asks before it resets
             self.reset()
         if self.agent not in (self._team_env.action_masks() or {}):
             raise AttributeError(f"The environment gives {self.agent!r} no action masks.")
         return self._masks
 
     def render(self) -> Any:
-        """
-        :return: what the environment's own ``render()`` returns; after the end of an episode this shows the next one
-        """
+        """Return what the environment's own ``render()`` returns; after the end of an episode this shows the next one."""
         return self._joint.render()
 
     def close(self) -> None:
@@ -207,10 +218,14 @@ class AgentEnv(gym.Env):
 
     def _step_team(self, action: Any) -> tuple[bool, AgentStep]:
         """
-        :return: whether the team's episode is over (then the next one has begun), and the learner's part of the step
+        Step the team with the learner's action and those of the partners.
+
+        :param action: The learner's action
+        :return: Whether the team's episode is over (the next one has then begun), and the learner's part of the step
         """
         actions = {self.agent: np.asarray(action)[None]}
         masks = self._team_env.action_masks() or {}
+        # SB3 models draw from the global generators, so each partner gets its own state of them while it acts
         self._callers_rng.suspend()
         try:
             for name, partner in self._partners.items():
@@ -221,15 +236,17 @@ class AgentEnv(gym.Env):
         finally:
             self._callers_rng.resume()
         step = self._team_env.step(actions)
-        parts = dict(zip(self._agents, self._splitter.split(actions, step), strict=True))
-        self._obs = step[0]
-        self._ended = {name: bool(part[2][0]) for name, part in parts.items()}
-        return bool(step[2][0]), parts[self.agent]
+        agent_steps = dict(zip(self._agents, self._splitter.split(actions, step), strict=True))
+        self._obs, _, team_dones, _ = step
+        self._ended = {name: bool(dones[0]) for name, (_, _, dones, _) in agent_steps.items()}
+        return bool(team_dones[0]), agent_steps[self.agent]
 
     def _play_to_the_end(self, action: Any) -> dict[str, Any]:
         """
-        :param action: any that the learner could do; nobody looks at it
-        :return: what there is to say at the end of the team's episode
+        Step the team to the end of its episode, after the learner has left.
+
+        :param action: Any action of the learner; it is ignored
+        :return: ``is_success`` of the episode if the environment reports it, otherwise nothing
         """
         team_over = False
         while not team_over:
@@ -239,7 +256,9 @@ class AgentEnv(gym.Env):
 
 def _make(env: Any, kwargs: dict[str, Any]) -> Any:
     """
-    :return: one environment; whether it is a ``ParallelEnv`` is not looked at here
+    Return the environment that an id, a callable or an environment stands for.
+
+    Its type is not checked here, but by ``JointEnv``.
     """
     if isinstance(env, str):
         return make_parallel_env(env, **kwargs)

@@ -1,4 +1,4 @@
-"""Fixed partners of one learner: whatever can choose actions for an agent of a team."""
+"""Fixed partners of a learner: models, saved files and functions that choose the actions of an agent in a team."""
 
 import inspect
 import io
@@ -22,11 +22,11 @@ from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.checkpoint import read_team
 from sb3_belief.team.predictor import PolicyState, Predictor
 
-# Path of a zip, an SB3 model or another object with its ``predict``, or a callable ``obs -> action``
+# The path of a zip, an SB3 model or another object with its ``predict``, or a callable ``obs -> action``
 PartnerLike: TypeAlias = Any
 
-# A zip of SB3 names its policy but not its algorithm. Of algorithms that share their policies one is enough: they differ in
-# how they learn, not in how they act (PPO also reads A2C's and TRPO's, TD3 also DDPG's)
+# An SB3 zip names its policy but not its algorithm. Where several algorithms have the same policies, one of them can load the
+# zips of all, since they differ in how they learn and not in how they act (PPO also reads A2C's and TRPO's, TD3 also DDPG's)
 _READERS: tuple[type[BaseAlgorithm], ...] = (
     BeliefPPO,
     MaskableBeliefPPO,
@@ -44,28 +44,30 @@ _READERS: tuple[type[BaseAlgorithm], ...] = (
 
 class CallersRng(RngState):
     """
-    What the caller draws from, kept by ``suspend`` while partners draw from their own streams. As light as can be, since it is
-    for every step, where ``RngSwitch`` would take longer than the rest.
+    The random number generators of the caller, whose state is kept while partners draw from their own.
+
+    It is used in every step, where ``RngSwitch`` would take longer than the rest of the step, and so does only what is needed.
     """
 
     def suspend(self) -> None:
-        """Note what the caller's generators are and how far they have come."""
+        """Keep the state of the caller's generators."""
+        # Unlike a partner's, the caller's numpy generator may be another object at each step
         self._numpy = mtrand.get_bit_generator()  # type: ignore[assignment]
         super().suspend()
 
 
 class Partner:
     """
-    Acts for one agent, with random numbers and a recurrent state of its own.
+    Partner that acts for one agent, with random number generators and a recurrent state of its own.
 
-    :param name: of the agent
-    :param given: what acts, see ``AgentEnv``
-    :param observation_space: of the agent
-    :param action_space: of the agent
-    :param deterministic: SB3 models take their most likely actions instead of samples
-    :param seed: of its random numbers, None: from the operating system's entropy
-    :raises TypeError: if it cannot act
-    :raises ValueError: if it has been made for other spaces, or if a zip cannot be read as a model
+    :param name: Name of the agent
+    :param given: What chooses the actions, see ``AgentEnv``
+    :param observation_space: Observation space of the agent
+    :param action_space: Action space of the agent
+    :param deterministic: Passed on to ``predict``: whether to take the most likely action instead of a sample
+    :param seed: Seed of its random numbers; None takes one from the operating system's entropy
+    :raises TypeError: If ``given`` cannot act
+    :raises ValueError: If it has been made for other spaces, or if a zip cannot be read as a model
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class Partner:
         self._new = True
         statistics: VecNormalize | None = None
         if isinstance(given, (str, os.PathLike)):
-            # Building a network draws random numbers, which the learner must not miss
+            # Building a network draws random numbers, which must not come from the learner's generators
             with RngSwitch(self.rng):
                 given, statistics = load_model(given, name)
         elif isinstance(given, BaseAlgorithm):
@@ -103,11 +105,13 @@ class Partner:
 
     def act(self, obs: Any, episode_start: bool, mask: np.ndarray | None) -> np.ndarray:
         """
-        :param obs: one observation of the agent
-        :param episode_start: whether its return has ended at the last step
-        :param mask: bool [k], its possible actions; None if the environment has no masks for it
-        :return: its action
-        :raises TypeError: if ``predict`` returns something else than an action and a state
+        Choose the agent's action.
+
+        :param obs: Observation of the agent
+        :param episode_start: Whether its return ended at the last step
+        :param mask: Its possible actions, bool ``[k]``; None if the environment has no masks for it
+        :return: The action
+        :raises TypeError: If ``predict`` does not return an action and a state
         """
         if self._predictor is None:
             kwargs = {"action_masks": mask} if self._takes_masks else {}
@@ -121,9 +125,11 @@ class Partner:
         action, self._state = result
         return np.asarray(action)
 
-    def start_anew(self, seed: int | None = None) -> None:
+    def reset(self, seed: int | None = None) -> None:
         """
-        :param seed: of its random numbers from now on, None: they go on
+        Reset the recurrent state, and the random numbers if a seed is given.
+
+        :param seed: Seed of its random numbers; None continues with its generators as they are
         """
         self._state, self._new = None, True
         if seed is not None:
@@ -132,15 +138,18 @@ class Partner:
 
 def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecNormalize | None]:
     """
-    :param path: of an SB3 zip, with or without ".zip"; of a saved team; or ``"team.zip:<agent>"``
-    :param agent: whose model is taken from a team's file that names none
-    :return: the model, and its normalisation if the team's file has one
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if it is damaged, lacks the agent, or is of an algorithm that is not known here
+    Load the model of a partner.
+
+    :param path: Path of an SB3 zip or of a saved team, with or without ".zip", or ``"team.zip:<agent>"``
+    :param agent: Name of the agent whose model is taken from a saved team, unless the path names one
+    :return: The model, and its normalisation if the team's file has one
+    :raises FileNotFoundError: If there is no such file
+    :raises ValueError: If it is damaged, lacks the agent, or holds a model of an algorithm that is not known here
     """
-    text = os.fspath(path)
-    head, colon, member = text.rpartition(":")
-    file, agent = (head, member) if colon and head.endswith(".zip") else (text, agent)
+    file = os.fspath(path)
+    head, _, member = file.rpartition(":")
+    if head.endswith(".zip"):
+        file, agent = head, member
     if not pathlib.Path(file).exists() and pathlib.Path(f"{file}.zip").exists():
         file = f"{file}.zip"
     if not pathlib.Path(file).is_file():
@@ -186,5 +195,5 @@ def _takes_masks(function: Callable[..., Any]) -> bool:
     try:
         return "action_masks" in inspect.signature(function).parameters
     except (TypeError, ValueError):
-        # What is written in C need not tell its arguments
+        # Callables written in C need not have a signature
         return False
