@@ -23,7 +23,7 @@ def _has_spread(key: str) -> bool:
 
 class _LatestValues(KVWriter):
     """
-    Writer that hands the values of an agent's logger to the team's log, which keeps the latest.
+    Writer that passes the values of an agent's logger to the team's log, which keeps the latest.
 
     :param agent: Name of the agent
     :param log: The team's log

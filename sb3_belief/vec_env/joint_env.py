@@ -108,7 +108,7 @@ class JointEnv(gym.Env):
         self._others = np.array([[j for j in everyone if j != i] for i in agents], dtype=int).reshape(len(agents), -1)
         self._scripted_in_play = np.ones(n_scripted, dtype=bool)
         self._mask_widths = {agent: mask_width(self.action_spaces[agent]) for agent in self.possible_agents}
-        # The records of all uneventful steps share these arrays, so nobody may write into them
+        # The records of all uneventful steps share these arrays, so they are read-only
         self._uneventful = _Events(_no_flags(len(agents)), ended=False, left=[], successes=[])
         self._uneventful.flags.active[:] = True
         self._all_visible = np.ones(self._others.shape, dtype=bool)

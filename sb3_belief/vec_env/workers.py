@@ -171,7 +171,7 @@ class WorkersVecEnv(SubprocVecEnv):
             self._end_all()
             raise RuntimeError(
                 f"Environment worker process {', '.join(dead) or 'unknown'} died during {doing}(); see its own error above,"
-                " if it could write one. The other workers have been ended: make a new environment to go on."
+                " if it could write one. The other workers have been ended: make a new environment to continue."
             ) from error
 
     def _end_all(self) -> None:
