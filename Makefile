@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
 PEERS_VENV := .venv-peers
 PEERS_STAMPS := $(patsubst %,$(PEERS_VENV)/%/.installed,rllib agilerl benchmarl)
-SOURCES := sb3_belief tests benchmarks studies train.py
+SOURCES := sb3_belief tests benchmarks studies examples docs/conf.py train.py
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
 # As many tests at once as there are cores; PYTEST_JOBS=0 for one after the other
@@ -15,7 +16,7 @@ PYTEST_JOBS ?= auto
 CONFORMANCE_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench bench-peers lint type format \
+.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench bench-peers docs lint type format \
 	check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -75,6 +76,13 @@ test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from i
 test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
 	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/test_smax.py $(PYTEST_ARGS)
 
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	@touch $@
+
+docs: $(DOCS_STAMP)  ## build the pages into docs/_build/html; any warning is an error
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
 lint: $(STAMP)  ## look for mistakes
 	$(BIN)/ruff check $(SOURCES)
 
@@ -92,5 +100,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) $(SMAX_VENV) $(PEERS_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -33,7 +33,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         ``attention_entropy``, of the attention weights, in nats, at most log N_h;
         ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
         ``visible_fraction``, share of the others that are visible;
-        ``first_log_ratio``, largest |log ratio| of the policies that acted and that is trained: 0 but for rounding.
+        ``first_log_ratio``, largest ``|log ratio|`` of the policies that acted and that is trained: 0 but for rounding.
         Measures of parts that a belief does not have (a prediction, a sampled latent, attention) are left out
     """
     rows = np.flatnonzero(buffer.active)

@@ -74,7 +74,7 @@ class JointEnv(gym.Env):
     have left. The info of a step holds a ``StepRecord`` under ``joint``; ``ParallelTeamVecEnv`` turns it into the infos of a
     ``TeamVecEnv``.
 
-    :param env: The environment; the README says what it may offer beyond PettingZoo's interface
+    :param env: The environment; the page "What an agent sees" says what it may offer beyond PettingZoo's interface
     :param visibility: Says whose actions agents could observe, for an environment that does not say so itself; see
         ``make_team_env``
     :param copy: Number of this copy, used in error messages
