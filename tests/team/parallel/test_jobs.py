@@ -214,7 +214,10 @@ class Odd(PPO):
         self.at, self.error, self.kill, self.interrupt = at, error, kill, interrupt
         self.trained_in: list[int] = []
         self.kept: Any = None
+        self.only_at_first = 1
         super().__init__(*args, **kwargs)
+        if kwargs.get("_init_setup_model", True):
+            self.policy.only_at_first = 1  # type: ignore[assignment]
 
     def train(self):
         super().train()
@@ -224,6 +227,8 @@ class Odd(PPO):
             self.aux = th.nn.Linear(2, 2)
             self.aux_optimizer = th.optim.Adam(self.aux.parameters())
             self.kept = [self.aux.weight, self.policy]
+            for owner in (self, self.policy):
+                vars(owner).pop("only_at_first", None)
         self.aux_optimizer.zero_grad()
         self.aux(th.ones(2)).sum().backward()
         self.aux_optimizer.step()
@@ -254,6 +259,7 @@ def test_an_algorithm_of_ones_own_may_change_anything_of_its_model(watched):
             # Whoever holds a part of the model still does
             assert all(new is old for new, old in zip([model.policy, *model.policy.parameters()], before[agent], strict=True))
             assert model.kept[1] is model.policy
+            assert not hasattr(model, "only_at_first") and not hasattr(model.policy, "only_at_first")
             assert model.aux_optimizer.param_groups[0]["params"][0] is model.aux.weight
             assert model.logger.name_to_excluded["odd/hidden"] == ("stdout",) and len(model.trained_in) == 3
         aux = {agent: (model.aux.weight, model.aux_optimizer.state_dict()["state"]) for agent, model in team.agents.items()}
