@@ -32,3 +32,5 @@ autodoc_mock_imports = ["jax", "jaxmarl"]
 html_theme = "sphinx_rtd_theme"
 html_theme_options = {"navigation_depth": 3, "collapse_navigation": False}
 html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]

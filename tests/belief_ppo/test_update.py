@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_belief.belief_ppo.buffers import attach, attached
-from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model
+from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model, record_beliefs
 
 BOX = spaces.Box(-1, 1, (2,), np.float32)
 
@@ -126,3 +126,22 @@ def test_minibatches_serve_the_policy_as_any_observations():
     plain = th.as_tensor(samples.observations.numpy().copy())
     assert attached(samples.observations) is not None and attached(plain) is None
     assert th.equal(model.policy.predict_values(samples.observations), model.policy.predict_values(plain))
+
+
+def test_an_update_attends_to_the_rows_that_acting_attended_to():
+    # A large step, so that the most similar rows are others at the end of the update than in the rollout
+    model = make_model(learning_rate=1e-1, n_epochs=4).learn(2 * ROLLOUT)
+    beliefs, minibatches = record_beliefs(model.policy), []
+    get = model.rollout_buffer.get
+
+    def watched(batch_size):
+        for samples in get(batch_size):
+            minibatches.append(attached(samples.observations))
+            yield samples
+
+    model.rollout_buffer.get = watched
+    model.learn(ROLLOUT)
+    trained = [belief for belief in beliefs if belief.latent.requires_grad]
+    assert len(trained) == len(minibatches) == 12
+    for belief, minibatch in zip(trained, minibatches, strict=True):
+        assert th.equal(belief.selected, minibatch.selected)
