@@ -21,32 +21,28 @@ from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
 from sb3_belief.belief_ppo.others import OthersPrediction
 
 
-class _FastAdam:
+def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
-    PyTorch's fused Adam: one call for all weights instead of ten for each of these many small ones, with the same step to the
-    last bits.
+    Add PyTorch's fused implementation to Adam's arguments, unless the user has chosen another.
+
+    It makes one call for all weights instead of ten for each of these many small ones, and the same step to the last bits.
+
+    :param optimizer_kwargs: The user's arguments, or SB3's
     """
+    chosen = optimizer_kwargs.keys() & {"fused", "foreach", "capturable", "differentiable"}
+    return dict(optimizer_kwargs) if chosen else {**optimizer_kwargs, "fused": True}
 
-    @staticmethod
-    def kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """
-        Add the fused implementation to Adam's arguments, unless the user has chosen another.
 
-        :param optimizer_kwargs: The user's arguments, or SB3's
-        """
-        chosen = optimizer_kwargs.keys() & {"fused", "foreach", "capturable", "differentiable"}
-        return dict(optimizer_kwargs) if chosen else {**optimizer_kwargs, "fused": True}
+def _count_fused_step(optimizer: th.optim.Optimizer, *_: Any) -> None:
+    """
+    Increment the version counters of the weights after a step, which fused optimisers do not: what was computed from the
+    weights is stale (see ``TensorVersions``).
 
-    @staticmethod
-    def count_step(optimizer: th.optim.Optimizer, *_: Any) -> None:
-        """
-        Increment the version counters of the weights, which a fused step does not: what was computed from them is stale.
-
-        :param optimizer: Has made a step, of which this is the hook
-        """
-        for group in optimizer.param_groups:
-            for weights in group["params"] if group.get("fused") else ():
-                increment_version(weights)
+    :param optimizer: Has made the step, of which this is the hook
+    """
+    for group in optimizer.param_groups:
+        for weights in group["params"] if group.get("fused") else ():
+            increment_version(weights)
 
 
 class _Unchecked:
@@ -107,16 +103,16 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
 
     def _build(self, lr_schedule: Schedule) -> None:
         if self.optimizer_class is th.optim.Adam:
-            self.optimizer_kwargs = _FastAdam.kwargs(self.optimizer_kwargs)
+            self.optimizer_kwargs = _fused_adam_kwargs(self.optimizer_kwargs)
         super()._build(lr_schedule)
-        self.optimizer.register_step_post_hook(_FastAdam.count_step)
+        self.optimizer.register_step_post_hook(_count_fused_step)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         # A copied optimiser has no hooks
-        self.optimizer.register_step_post_hook(_FastAdam.count_step)
+        self.optimizer.register_step_post_hook(_count_fused_step)
 
-    # -- what the algorithm uses ---------------------------------------------------------------------------------------
+    # -- what the algorithm and users call ------------------------------------------------------------------------------
 
     @property
     def _extractor(self) -> BeliefExtractor:
@@ -135,16 +131,18 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
 
     def remember(self, observations: np.ndarray | dict[str, np.ndarray], actions: np.ndarray) -> None:
         """
-        Append the agent's own active steps to its history: all that an agent needs to adapt to other teammates. The algorithm
-        does so after each update; where an agent is deployed, its user does. A belief without a history remembers nothing.
+        Append the agent's own active steps to its history, which is all that it needs to adapt to other teammates.
+
+        The algorithm does so after each update; for a deployed agent its user does. A belief without a history remembers
+        nothing.
 
         :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
         :param actions: The others' flattened actions at these steps, ``[N, W]``, zero where not visible
-        :raises ValueError: if the actions are not of this shape
+        :raises ValueError: If the actions are not of this shape
         """
         if self.history is None:
             return
-        # Images with the channels last come as the environment gives them, too
+        # obs_to_tensor() accepts images with the channels last, as the environment returns them
         rows = self.flat_observations(self.obs_to_tensor(observations)[0])
         if actions.shape != (len(rows), self.layout.width):
             raise ValueError(
@@ -156,8 +154,10 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
-        :param observations: Observations as the environment gives them, batch first
-        :return: As belief and history take them: preprocessed as SB3 does, and flat, ``[B, d_o]``
+        Convert observations to what belief and history take: preprocessed as SB3 does, and flat.
+
+        :param observations: Observations as the environment returns them, batch first
+        :return: ``[B, d_o]``
         """
         return flat_observations(self, observations)
 
@@ -308,11 +308,11 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
 
     def predict_others(self, observation: np.ndarray | dict[str, np.ndarray]) -> OthersPrediction:
         """
-        What the agent believes the others do when it is shown an observation now. The prediction is that of the belief's mean.
+        Return what the agent believes that the others do at an observation now, predicted from the belief's mean.
 
         :param observation: One observation or a batch of them, as :meth:`predict` takes them
         :return: The others' expected actions, the belief behind them, and the history rows that it comes from
-        :raises ValueError: for a policy that predicts nothing
+        :raises ValueError: For a policy that predicts nothing
         """
         if not (self.has_belief and self.options.variant.predicts):  # type: ignore[union-attr]
             raise ValueError(
@@ -347,18 +347,18 @@ class BeliefActorCriticPolicy(BeliefPolicyMixin, ActorCriticPolicy):
 
 
 class BeliefMlpPolicy(BeliefActorCriticPolicy):
-    """The same for vectors; images are flattened."""
+    """A policy with a belief for vectors; images are flattened."""
 
     default_extractor = FlattenExtractor
 
 
 class BeliefCnnPolicy(BeliefActorCriticPolicy):
-    """The same for images."""
+    """A policy with a belief for images."""
 
     default_extractor = NatureCNN
 
 
 class BeliefMultiInputPolicy(BeliefActorCriticPolicy):
-    """The same for Dicts."""
+    """A policy with a belief for Dict observations."""
 
     default_extractor = CombinedExtractor
