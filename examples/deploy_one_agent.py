@@ -1,5 +1,5 @@
 """
-One agent is saved, loaded without its team, and adapts to partners it has not met by watching them, without a gradient step.
+One agent is saved, loaded without its team, and adapts to each new partner by watching it, without a gradient step.
 
     python examples/deploy_one_agent.py
 """
@@ -18,9 +18,10 @@ CUES = np.arange(3)
 
 
 def train_and_save(total_timesteps: int, path: Path) -> None:
-    """Train a follower to play what its leader plays at each of three cues, and save it. The leaders change all the time."""
+    """Train a follower to play what its leader plays at each of three cues, and save the follower."""
     env = make_team_env("convention-swap", n_envs=25, seed=0, env_kwargs={"m": 3})
-    # The history holds one rollout, of one leader. The steps are independent of each other, hence gamma=0
+    # The convention of the leader changes after every second rollout. The history holds one rollout, hence one
+    # convention. The steps are independent of each other, hence gamma=0
     kwargs: dict[str, Any] = {"n_steps": 16, "batch_size": 200, "n_epochs": 4, "learning_rate": 1e-3, "gamma": 0.0}
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, ent_coef=0.01, history_length=400, **kwargs)
     team.learn(total_timesteps).agents["follower"].save(path)
@@ -40,7 +41,7 @@ def main(total_timesteps: int = 30_000) -> dict[str, float]:
         follower.policy.remember(watched, np.eye(3, dtype=np.float32)[leader[watched]])
         after.append(follower.predict(CUES, deterministic=True)[0] == leader)
         believed = follower.policy.predict_others(CUES).actions["leader"].argmax(axis=1)
-        print(f"A leader plays {leader}. After watching it for 400 steps the follower expects {believed}.")
+        print(f"A leader plays {leader} at the cues 0 1 2. After 400 steps of watching the follower expects {believed}.")
     rates = {"before": float(np.mean(before)), "after": float(np.mean(after))}
     print("Cues at which the follower plays what a new leader plays:", end=" ")
     print(f"{rates['before']:.0%} while it still expects the previous leader, {rates['after']:.0%} after watching.")

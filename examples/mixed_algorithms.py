@@ -22,7 +22,7 @@ AGENT_KWARGS: dict[str, dict[str, Any]] = {
     "car_1": PPO_KWARGS,
     "car_2": PPO_KWARGS,
     "car_3": {"n_steps": 10},
-    "car_4": {"learning_starts": 2_000, "buffer_size": 30_000, "exploration_fraction": 0.5},
+    "car_4": {"learning_rate": 1e-3, "train_freq": 1, "target_update_interval": 500, "exploration_final_eps": 0.02},
 }
 
 
