@@ -1,4 +1,4 @@
-"""What several tests of the belief's SB3 side use."""
+"""Helpers that several tests of BeliefPPO share."""
 
 from typing import Any
 
@@ -18,19 +18,19 @@ SMALL: dict[str, Any] = dict(n_steps=14, batch_size=14, n_epochs=2, seed=0, hist
 ROLLOUT = 42
 VARIANTS = ["dynamic", "context", "variational", "static", "wide"]
 ALGORITHMS = [BeliefPPO, MaskableBeliefPPO]
-#: Every variant, and with masks one that has all parts and one that has none: the belief's code is the same
+#: Every variant without masks, but with masks only the one with all parts and the one with none: the belief's code is the same
 EVERY = [*((BeliefPPO, belief) for belief in (*VARIANTS, "none")), (MaskableBeliefPPO, "dynamic"), (MaskableBeliefPPO, "none")]
 
 
 def make_model(n_envs: Any = 3, env_kwargs: Any = None, algorithm: Any = BeliefPPO, **kwargs: Any) -> Any:
-    """A small untrained model, its environment seeded."""
+    """Return a small untrained model in a seeded environment."""
     env_class = MaskedAmongOthers if issubclass(algorithm, MaskableBeliefPPO) else AmongOthers
     env = make_vec_env(env_class, n_envs=n_envs, seed=0, env_kwargs=env_kwargs)
     return algorithm("BeliefPolicy", env, **{**SMALL, **kwargs})
 
 
 def observations_of(model: Any, n: int) -> Any:
-    """Some observations, as a vectorised environment gives them."""
+    """Return ``n`` sampled observations, batched as by a vectorised environment."""
     samples = [model.observation_space.sample() for _ in range(n)]
     if isinstance(model.observation_space, spaces.Dict):
         return {key: np.stack([sample[key] for sample in samples]) for key in samples[0]}
@@ -38,13 +38,17 @@ def observations_of(model: Any, n: int) -> Any:
 
 
 def same_parameters(a: Any, b: Any) -> bool:
-    """Whether all weights of two models, and their histories, are the same bit for bit."""
+    """Return whether all weights and the histories of two models are the same bit for bit."""
     pairs = list(zip(a.policy.state_dict().items(), b.policy.state_dict().items(), strict=True))
     return all(name == other and th.equal(x, y) for (name, x), (other, y) in pairs) and len(pairs) > 5
 
 
 class Watch(BaseCallback):
-    """Looks at the model after each rollout, and predicts in between, as an evaluation callback does."""
+    """
+    Callback that inspects the model after each rollout, and predicts at each step as an evaluation callback does.
+
+    :param look: Called with the model
+    """
 
     def __init__(self, look: Any) -> None:
         super().__init__()
@@ -59,7 +63,7 @@ class Watch(BaseCallback):
 
 
 class Values(KVWriter):
-    """Keeps all that is logged, but for the time it took."""
+    """Log writer that keeps all logged values except those under ``time/``."""
 
     def __init__(self) -> None:
         self.written: list[dict[str, Any]] = []
@@ -69,7 +73,7 @@ class Values(KVWriter):
 
 
 class Trace(BaseCallback):
-    """Notes every number of a training: rollouts, gradients, weights and history at each optimiser step, and all logs."""
+    """Callback that records a training: rollouts, gradients, weights and history at each optimiser step, and all logs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +114,7 @@ class Trace(BaseCallback):
         self._note("last state", self.model.policy.state_dict())
 
     def differences(self, other: "Trace") -> set[str]:
-        """The names of all that is not the same bit for bit."""
+        """Return the names of all recorded values that are not the same bit for bit."""
         assert [name for name, _ in self.entries] == [name for name, _ in other.entries] and len(self.entries) > 50
         pairs = zip(self.entries, other.entries, strict=True)
         return {name for (name, a), (_, b) in pairs if not np.array_equal(a, b, equal_nan=a.dtype.kind == "f")}
@@ -121,7 +125,7 @@ def record_beliefs(policy: Any) -> list[BeliefOutput]:
     Record the beliefs that a policy infers from now on.
 
     :param policy: A policy with a belief
-    :return: They, in the order of the passes
+    :return: List to which each forward pass appends its belief
     """
     outputs: list[BeliefOutput] = []
     infer = policy.features_extractor.infer

@@ -1,4 +1,4 @@
-"""Environments of one agent among scripted others, small enough to know every number."""
+"""Tiny environments of one agent among others that act at random."""
 
 from typing import Any
 
@@ -9,15 +9,18 @@ from gymnasium import spaces
 
 class AmongOthers(gym.Env):
     """
-    One agent among others who act at random and are visible now and then.
+    Environment of one agent among others that act at random and are visible at some steps.
 
-    It is careless: it does not zero the actions of those whom the agent does not see.
+    Unlike a correct environment it does not zero the actions of those others that are not visible. The model must ignore
+    them by itself.
 
-    :param others: Their action spaces
-    :param invisible_seed: Seed of the actions that the agent does not see; must change nothing for it
-    :param inactive: Every how many steps the agent is out of play, 0 for never
+    :param others: Action spaces of the others by name. None for one of 3 and one of 4 discrete actions
+    :param invisible_seed: Seed of the actions that are not visible. It must not make any difference to the agent
+    :param inactive: The agent is out of play at every step whose number this divides. 0 for never
     :param episode_length: Steps until the time limit
-    :param visible: Probability that an other is visible, of each at each step
+    :param action_space: Action space of the agent. None for 3 discrete actions
+    :param observation_space: Observation space of the agent. None for 5 numbers in [-1, 1]
+    :param visible: Probability with which each of the others is visible at a step
     """
 
     def __init__(
@@ -58,7 +61,14 @@ class AmongOthers(gym.Env):
         return self.observation_space.sample(), reward, False, self.steps >= self.episode_length, self._info()
 
     def action_masks(self) -> np.ndarray:
-        """At step t every third choice is impossible, of the binary ones every third one; only a subclass insists on it."""
+        """
+        Return the masks of the next action, bool ``[k]``.
+
+        Every third choice is impossible, for MultiBinary a one in every third component. Which ones depends on the step. Only
+        the subclass ``MaskedAmongOthers`` raises if an impossible action is taken.
+
+        :return: Whether each choice is possible
+        """
         space, possible = self.action_space, (np.arange(20) + self.steps) % 3 != 0
         if isinstance(space, spaces.Discrete):
             return possible[: space.n]
@@ -69,7 +79,7 @@ class AmongOthers(gym.Env):
 
 
 class MaskedAmongOthers(AmongOthers):
-    """The same, where doing what is impossible is an error."""
+    """An ``AmongOthers`` that raises if an impossible action is taken."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         possible, start = self.action_masks(), 0
@@ -81,14 +91,14 @@ class MaskedAmongOthers(AmongOthers):
 
 
 def choices_of(space: spaces.Space) -> list[int]:
-    """How many choices there are for each component of an action."""
+    """Return the number of choices for each component of an action."""
     if isinstance(space, spaces.Discrete):
         return [int(space.n)]
     return [int(n) for n in space.nvec] if isinstance(space, spaces.MultiDiscrete) else [2] * spaces.flatdim(space)
 
 
 def flat_sample(space: spaces.Space, rng: np.random.Generator) -> np.ndarray:
-    """A flattened action of a space from a generator at hand."""
+    """Draw an action of a space from a given generator and return it flattened."""
     if isinstance(space, spaces.Box):
         return rng.uniform(space.low, space.high).astype(np.float32).flatten()
     if isinstance(space, spaces.MultiBinary):

@@ -1,4 +1,4 @@
-"""What several tests of the team use."""
+"""Helpers that several tests of the team share."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief import team
 
-# Tests look inside, at what the types of a protocol do not promise
+# Typed as Any, since tests also look at attributes that the public types do not have
 Team: Any = team.Team
 make_team_env: Any = team.make_team_env
 
@@ -22,18 +22,16 @@ PPO_KWARGS: dict[str, Any] = {
 
 
 def parameters(model):
-    """
-    :return: all weights of a model as one vector
-    """
+    """Return a copy of all weights of a model as one vector."""
     return th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
 
 
 class Record(BaseCallback):
     """
-    Notes what is called and when, and at each step keeps copies of some of SB3's locals.
+    Callback that records its events in order, and at each step copies of some of SB3's locals.
 
-    :param keep: names of the locals
-    :param stop_at: count of its calls at which it stops the training
+    :param keep: Names of the locals
+    :param stop_at: Number of the step at which it stops the training, counted from 1. None not to stop it
     """
 
     def __init__(self, keep=(), stop_at=None):
@@ -61,9 +59,7 @@ class Record(BaseCallback):
 
     @property
     def steps(self):
-        """
-        :return: number of steps seen
-        """
+        """Number of steps so far."""
         return self.events.count("step")
 
 

@@ -1,4 +1,4 @@
-"""Tiny ``ParallelEnv``s for tests: each shows one thing, and what happens at a step can be told beforehand."""
+"""Tiny ``ParallelEnv``s for tests. Each shows one thing, and what happens at a given step is known in advance."""
 
 import os
 from typing import Any, ClassVar
@@ -11,12 +11,13 @@ from pettingzoo import ParallelEnv
 
 class ToyEnv(ParallelEnv):
     """
-    Agents that do not influence each other: each walks by itself, for ``limit`` steps, and is rewarded near the origin.
+    Agents that do not influence each other.
 
-    Every agent has a generator of its own, so that what it meets does not depend on how many teammates it has.
+    Each of them walks for ``limit`` steps and gets a higher reward the closer it is to the origin. It has a random generator
+    of its own, so that its observations and rewards do not depend on the number of teammates.
 
-    :param n_agents: number of agents
-    :param limit: length of an episode, which ends by truncation
+    :param n_agents: Number of agents
+    :param limit: Length of an episode, which ends by truncation
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "toy", "render_modes": ["rgb_array"]}
@@ -73,10 +74,10 @@ class ToyEnv(ParallelEnv):
 
 class ToySolo(gym.Env):
     """
-    What agent ``index`` of a ``ToyEnv`` meets, as a Gymnasium environment.
+    Agent ``index`` of a ``ToyEnv``, alone in a Gymnasium environment with the same observations and rewards.
 
-    :param index: which agent
-    :param limit: length of an episode
+    :param index: Index of the agent
+    :param limit: Length of an episode
     """
 
     def __init__(self, index: int = 0, limit: int = 7):
@@ -94,14 +95,15 @@ class ToySolo(gym.Env):
 
 class ScriptedEnv(ParallelEnv):
     """
-    Everything that can end an agent's return, at known steps (counted from 1) of an episode of 8.
+    Every kind of end that an agent's return can have, at known steps (counted from 1) of an episode of 8.
 
-    - ``stays`` ends its life at step 3 and remains in the team, inactive at steps 4 and 5
+    - The life of ``stays`` ends at step 3. It remains in the team and is inactive at steps 4 and 5
     - ``dies`` terminates at step 5 and leaves
     - ``cut`` is truncated at step 6 and leaves
-    - ``last`` goes on to the end, which is a time limit
+    - ``last`` plays to the end of the episode, which is a time limit
 
-    Observations are [step, 10 * episode]; the reward is 1 + 10 * index of the agent + step / 100, for the dead too.
+    Observations are [step, 10 * episode]. The reward is 1 + 10 * index of the agent + step / 100, also for agents that have
+    left.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "scripted"}
@@ -145,9 +147,11 @@ class ScriptedEnv(ParallelEnv):
 
 class MixedEnv(ParallelEnv):
     """
-    Spaces of every kind; who sees whose actions changes with the step: agent i sees the others j with (i + j + step) even.
+    Agents with spaces of every kind, and a visibility that changes with the step.
 
-    :param limit: length of an episode, which ends by termination
+    Agent i sees the actions of those agents j for which i + j + step is even.
+
+    :param limit: Length of an episode, which ends by termination
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "mixed"}
@@ -215,7 +219,7 @@ class MixedEnv(ParallelEnv):
 
 
 class MaskedEnv(ToyEnv):
-    """Only action (t + i) % 3 is possible for agent i at step t; any other one is an error. The last agent has no mask."""
+    """A ``ToyEnv`` whose masks allow agent i only action (t + i) % 3 at step t. Others raise. The last agent has no mask."""
 
     def infos(self):
         infos: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
@@ -232,9 +236,9 @@ class MaskedEnv(ToyEnv):
 
 class FaultyEnv(ToyEnv):
     """
-    Fails at a given step of the second episode.
+    A ``ToyEnv`` that fails at the third step of the second episode.
 
-    :param fault: "raise" an error, or "exit" the process without a word
+    :param fault: ``"raise"`` to raise an error, or ``"exit"`` to end the process without any message
     """
 
     def __init__(self, fault: str, **kwargs):
@@ -256,12 +260,14 @@ class FaultyEnv(ToyEnv):
 
 class PartneredEnv(ParallelEnv):
     """
-    Two learners, and two scripted others that tell by what they do which step it was: ``wind`` (Box) does [step, -episode],
-    ``leader`` (Discrete) does (step - 1) % 4, as the observation before the step has it one-hot. Learner ``ball`` leaves after
-    step 3 and learner ``arrow`` goes on to the end of the episode, ``limit``, a time limit.
+    Two learners and two scripted others, whose actions show at which step they were taken.
 
-    :param limit: length of an episode
-    :param ball_leaves: whether it does
+    The action of ``wind`` (Box) is [step, -episode]. That of ``leader`` (Discrete) is (step - 1) % 4, which the observation
+    before the step holds as a one-hot. The learner ``ball`` leaves after step 3, and the learner ``arrow`` stays until the
+    time limit.
+
+    :param limit: Length of an episode, which ends by truncation
+    :param ball_leaves: Whether ``ball`` leaves after step 3
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "partnered"}
@@ -272,7 +278,7 @@ class PartneredEnv(ParallelEnv):
         self.agents: list[str] = []
         self.limit, self.ball_leaves = limit, ball_leaves
         self.t = self.episode = 0
-        # the order is the dict's, not the alphabet's
+        # The order of the others is that of this dict, which is not alphabetical
         self.scripted_action_spaces = {"wind": spaces.Box(-100, 100, (2,), np.float32), "leader": spaces.Discrete(4)}
 
     def observation_space(self, agent):
@@ -302,7 +308,12 @@ class PartneredEnv(ParallelEnv):
 
 
 class BlinkingEnv(PartneredEnv):
-    """As ``PartneredEnv``; at step t ``arrow`` sees those of [ball, wind, leader] whose bit is set in t, ``ball`` the rest."""
+    """
+    A ``PartneredEnv`` whose visibility changes with the step.
+
+    At step t ``arrow`` sees those of [ball, wind, leader] whose bits are set in t. ``ball`` sees those of [arrow, wind,
+    leader] whose bits are not set.
+    """
 
     def visibility(self):
         bits = np.array([self.t & 1, self.t & 2, self.t & 4], dtype=bool)
