@@ -1,4 +1,4 @@
-"""What an agent remembers: its own last steps, each with the actions of the others it could see."""
+"""The history of an agent: its own last steps, each with the actions of the others that it could see."""
 
 from typing import NamedTuple
 
@@ -7,12 +7,12 @@ import torch as th
 
 class History(NamedTuple):
     """
-    The agent's last ``T`` active steps (Sec. 4.1 of the paper), oldest first.
+    The last ``T`` steps in which an agent was active (Sec. 4.1 of the paper), oldest first.
 
     :param observations: The agent's own observations, float ``[T, d_o]``
-    :param actions: The others' actions at the same steps, flattened and side by side, float ``[T, W]``;
-        zero where an action was not visible
-    :param valid: Which rows hold a step, bool ``[T]``: all, once the agent has lived for ``T`` steps
+    :param actions: The others' actions at the same steps, flattened and side by side, float ``[T, W]``.
+        Zero where an action was not visible
+    :param valid: Whether each row holds a step, bool ``[T]``. All rows do once the agent has been active for ``T`` steps
     """
 
     observations: th.Tensor
@@ -22,22 +22,24 @@ class History(NamedTuple):
 
 def empty_history(length: int, observation_dim: int, action_dim: int) -> History:
     """
-    :param length: ``T``, the number of steps to remember, at least 1
-    :param observation_dim: ``d_o``
-    :param action_dim: ``W``
-    :return: A history in which nothing has happened yet
+    Return a history without any steps.
+
+    :param length: Number of rows ``T``, at least 1
+    :param observation_dim: Width ``d_o`` of an observation
+    :param action_dim: Width ``W`` of the others' actions
+    :return: A history of which no row is valid
     """
     return History(th.zeros(length, observation_dim), th.zeros(length, action_dim), th.zeros(length, dtype=th.bool))
 
 
 def append_rows(history: History, observations: th.Tensor, actions: th.Tensor) -> History:
     """
-    The history after further steps: the newest ``T`` of the old and the new rows.
+    Return the history after further steps, which holds the newest ``T`` of the old and the new rows.
 
-    :param history: What is remembered so far, ``T`` rows
-    :param observations: The new steps' observations, oldest first, ``[N, d_o]``
+    :param history: History of ``T`` rows. It is not changed
+    :param observations: Observations of the new steps, oldest first, ``[N, d_o]``
     :param actions: The others' actions at those steps, ``[N, W]``
-    :return: A new history of the same length; the one given is left as it is
+    :return: A new history of ``T`` rows, the valid ones first
     """
     length = len(history.valid)
     observations = th.cat([history.observations[history.valid], observations.to(history.observations)])[-length:]

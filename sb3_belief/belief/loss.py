@@ -1,4 +1,4 @@
-"""The two terms that train a belief (eq. 7 and 8 of the paper), and what a prediction says of the others' actions."""
+"""The two losses that train a belief (eq. 7 and 8 of the paper), and the actions that a prediction stands for."""
 
 from collections.abc import Callable
 from types import MappingProxyType
@@ -8,34 +8,38 @@ import torch.nn.functional as F
 
 from sb3_belief.belief.layout import ActionLayout
 
+# (prediction, actions, visible, layout) -> scalar
 Loss = Callable[[th.Tensor, th.Tensor, th.Tensor, ActionLayout], th.Tensor]
 
 
 def squared_error(prediction: th.Tensor, actions: th.Tensor, visible: th.Tensor, layout: ActionLayout) -> th.Tensor:
     """
-    Squared error of the predicted actions of the visible others (eq. 7), summed over the components of an action
-    and averaged over the visible others of the batch. The paper writes a norm and calls it a mean squared error;
-    the square is what its derivation from the likelihood (eq. 6) gives.
+    Return the squared error of the predicted actions of the visible others (eq. 7).
 
-    :param prediction: Predicted actions ``[B, W]``
-    :param actions: Actions taken ``[B, W]``
-    :param visible: Whose action was visible, bool ``[B, n_others]``
-    :param layout: Where each of the others stands
-    :return: A scalar, zero where nobody is visible
+    It is summed over the components of an action and averaged over all visible others of the batch. The paper writes a norm
+    and calls it a mean squared error. We take the square, which its derivation from the likelihood (eq. 6) gives.
+
+    :param prediction: Predicted actions, float ``[B, W]``
+    :param actions: Actions taken, float ``[B, W]``
+    :param visible: Whether each of the others' actions was visible, bool ``[B, n_others]``
+    :param layout: Layout of the others' actions
+    :return: A scalar, zero if no action is visible
     """
     return _mean_over_visible((actions - prediction).square(), visible, layout)
 
 
 def cross_entropy(prediction: th.Tensor, actions: th.Tensor, visible: th.Tensor, layout: ActionLayout) -> th.Tensor:
     """
-    Negative log-likelihood of the actions of the visible others (eq. 6) where the prediction holds logits: of a softmax for
-    each one-hot vector, of a sigmoid for each binary action. Summed and averaged as :func:`squared_error`.
+    Return the negative log-likelihood of the actions of the visible others (eq. 6), for a prediction that holds logits.
 
-    :param prediction: Logits ``[B, W]``
+    The logits are those of a softmax for each one-hot vector and of a sigmoid for each binary action. The loss is summed and
+    averaged as in :func:`squared_error`.
+
+    :param prediction: Logits, float ``[B, W]``
     :param actions: Actions taken, zeros and ones ``[B, W]``
-    :param visible: Whose action was visible, bool ``[B, n_others]``
-    :param layout: Where each of the others stands; none of them with numbers (Box)
-    :return: A scalar, zero where nobody is visible
+    :param visible: Whether each of the others' actions was visible, bool ``[B, n_others]``
+    :param layout: Layout of the others' actions, none of them numbers (Box)
+    :return: A scalar, zero if no action is visible
     """
     errors = th.zeros_like(prediction)
     for columns in layout.block_columns:
@@ -47,39 +51,42 @@ def cross_entropy(prediction: th.Tensor, actions: th.Tensor, visible: th.Tensor,
 
 
 def _mean_over_visible(errors: th.Tensor, visible: th.Tensor, layout: ActionLayout) -> th.Tensor:
-    # Selecting columns of numbers is twice as fast as of truth values
+    # One weight per column, copied from the agent that owns it. index_select is twice as fast on floats as on bools
     weights = visible.to(errors.dtype).index_select(1, layout.owner_index.to(errors.device))
     return (errors * weights).sum() / visible.sum().clamp(min=1)
 
 
-#: By the name that ``action_loss`` has for it
+#: The losses by the value of ``action_loss``
 ACTION_LOSSES: MappingProxyType[str, Loss] = MappingProxyType({"mse": squared_error, "cross_entropy": cross_entropy})
 
 
 def kl_divergence(mean: th.Tensor, log_std: th.Tensor) -> th.Tensor:
     """
-    Divergence of the belief from the standard normal prior (eq. 6), summed over the latent's components and averaged
-    over the batch.
+    Return the KL divergence of the belief from the standard normal prior (eq. 6).
 
-    :param mean: ``[B, z]``
-    :param log_std: ``[B, z]``
+    It is summed over the components of the latent and averaged over the batch.
+
+    :param mean: Mean of the belief, float ``[B, z]``
+    :param log_std: Logarithm of its standard deviation, float ``[B, z]``
     :return: A scalar, at least zero
     """
-    # exp() and one sum are faster than expm1() and two
+    # exp() with one sum is faster than expm1() with two
     total = 0.5 * (mean.square() + (2 * log_std).exp()) - log_std
     return (total - 0.5).sum() / len(mean)
 
 
 def expected_actions(prediction: th.Tensor, layout: ActionLayout, action_loss: str) -> th.Tensor:
     """
-    What a prediction says: probabilities for one-hot and binary actions, the mean for numbers. Trained by the squared error
-    the prediction itself estimates these probabilities, but may lie outside [0, 1] and needs not add up to one: it is clipped
-    and scaled (an estimate with nothing above zero says nothing, and becomes uniform).
+    Return the actions that a prediction stands for: probabilities for one-hot and binary actions, the mean for numbers.
 
-    :param prediction: Output of the decoder ``[B, W]``
-    :param layout: Where each of the others stands
-    :param action_loss: What it was trained with, ``"mse"`` or ``"cross_entropy"``
-    :return: ``[B, W]``
+    A decoder that was trained by the squared error estimates these probabilities directly, but its output may lie outside
+    [0, 1] and need not sum to one. It is therefore clipped and scaled. A one-hot vector for which no value is above zero
+    becomes uniform.
+
+    :param prediction: Output of the decoder, float ``[B, W]``
+    :param layout: Layout of the others' actions
+    :param action_loss: The loss that trained the decoder, ``"mse"`` or ``"cross_entropy"``
+    :return: Expected actions, float ``[B, W]``
     """
     result = prediction.clone()
     for columns in layout.block_columns:
@@ -87,7 +94,7 @@ def expected_actions(prediction: th.Tensor, layout: ActionLayout, action_loss: s
         if action_loss == "cross_entropy":
             result[:, columns] = part.softmax(dim=-1)
         else:
-            # Far below what a float32 adds to anything else, so it matters only where all are zero
+            # 1e-30 is lost in rounding beside any other value, so it only matters where all values are zero
             positive = part.clamp(min=0) + 1e-30
             result[:, columns] = positive / positive.sum(dim=-1, keepdim=True)
     if layout.binary_columns:

@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 class Variant(NamedTuple):
     """
-    :param attends: Whether the belief is inferred from the agent's history too (eq. 3 and 4), or from the observation alone
-    :param samples: Whether it is a distribution (eq. 5), held to the prior by the KL divergence, or a single point
-    :param predicts: Whether it is trained by predicting the others' actions (eq. 7)
+    One kind of belief, described by the three parts of the method that it has.
+
+    :param attends: Whether the belief is inferred from the agent's history too (eq. 3 and 4), or from its observation alone
+    :param samples: Whether the belief is a distribution (eq. 5), which the KL divergence keeps near the prior, or a point
+    :param predicts: Whether the belief is trained by predicting the others' actions (eq. 7)
     """
 
     attends: bool
@@ -16,9 +18,10 @@ class Variant(NamedTuple):
     predicts: bool
 
 
-#: ``dynamic`` is the paper's method, ``static`` and ``variational`` are its ablations ("static belief", "belief with LVI"),
-#: ``context`` completes the two by two. ``wide`` has as many weights as ``dynamic`` and none of its ideas: what it gains over
-#: no belief at all, a larger network gains.
+#: The values of ``belief`` other than ``"none"``. ``dynamic`` is the paper's method, ``static`` and ``variational`` are its
+#: ablations ("static belief" and "belief with LVI"), and ``context`` is the fourth combination of attending and sampling.
+#: ``wide`` has as many weights as ``dynamic`` but none of the three parts, so what it gains over no belief at all comes from
+#: the larger network.
 VARIANTS: MappingProxyType[str, Variant] = MappingProxyType(
     {
         "dynamic": Variant(attends=True, samples=True, predicts=True),
