@@ -1,1 +1,1 @@
-"""What all other packages build on: random number generators, processes, exceptions, versions."""
+"""Helpers of all other packages: random number generators, worker processes, exceptions, versions."""

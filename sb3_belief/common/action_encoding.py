@@ -1,4 +1,4 @@
-"""How an action is encoded as a vector: the one rule for what others' actions look like to an agent."""
+"""The encoding of actions as vectors, in which an agent gets the actions of the others."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ from gymnasium import spaces
 
 class ActionEncoding(NamedTuple):
     """
-    How ``gymnasium.spaces.flatten`` encodes the actions of a space.
+    Description of how ``gymnasium.spaces.flatten`` encodes the actions of a space.
 
     :param kind: ``"categorical"`` for one-hot vectors (Discrete, MultiDiscrete), ``"binary"`` for zeros and ones (MultiBinary)
         or ``"number"`` for the values themselves (Box)
-    :param widths: Widths of its parts: one for each dimension of a MultiDiscrete space, a single one otherwise
+    :param widths: Widths of the vector's parts: one for each dimension of a MultiDiscrete space, a single one otherwise
     """
 
     kind: str
@@ -20,18 +20,18 @@ class ActionEncoding(NamedTuple):
 
     @property
     def width(self) -> int:
-        """The width of the whole vector."""
+        """Width of the whole vector."""
         return sum(self.widths)
 
 
 def action_encoding(name: str, space: spaces.Space) -> ActionEncoding:
     """
-    Return how an agent's actions are encoded.
+    Return the encoding of an agent's actions.
 
-    :param name: Name of the agent, for the message
+    :param name: Name of the agent, for the error message
     :param space: Its action space
     :return: The encoding
-    :raises ValueError: If the space is of another kind than Discrete, MultiDiscrete, MultiBinary and Box
+    :raises ValueError: If the space is not Discrete, MultiDiscrete, MultiBinary or Box
     """
     if isinstance(space, spaces.Discrete):
         return ActionEncoding("categorical", [int(space.n)])

@@ -1,4 +1,4 @@
-"""What all worker processes of a team have in common."""
+"""Starting worker processes and receiving from them, for environment copies and for learning agents alike."""
 
 import multiprocessing
 import select
@@ -10,40 +10,52 @@ from typing import Any
 
 def start_context() -> Any:
     """
-    :return: how processes are started: as SB3 does it. One that has trained must not be forked, since autograd has threads
+    Return the ``multiprocessing`` context that starts workers, chosen as SB3 chooses it.
+
+    A process that has trained must not be forked, because autograd has started threads in it.
+
+    :return: The context of "forkserver" where the system has it, otherwise of "spawn"
     """
     return multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
 
 
 def leave_interrupts_to_main() -> None:
-    """To be called in a worker: the terminal sends Ctrl-C to the whole group, but it is the main process that ends workers."""
+    """
+    Ignore Ctrl-C in the calling worker process.
+
+    The terminal sends the signal to all processes of the group, but the main process decides when its workers end.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class Inbox:
     """
-    Where the main process waits for what a worker sends.
+    The main process's end of the pipe to a worker, which can wait for a message without waiting for a dead worker.
 
-    :param connection: to the worker
-    :param process: the worker
+    :param connection: Connection to the worker
+    :param process: The worker, a ``multiprocessing`` process
     """
 
     def __init__(self, connection: Connection, process: Any) -> None:
         self._process = process
-        self._arrives_within: Callable[[float], bool] = connection.poll
+        self._readable_within: Callable[[float], bool] = connection.poll
         if hasattr(select, "poll"):
-            # Connection.poll() registers with the system at each call, which takes most of its time
+            # Connection.poll() spends most of its time on registering the connection anew at each call, so it is registered
+            # once here. Windows has no select.poll and keeps Connection.poll()
             poll = select.poll()
             poll.register(connection.fileno(), select.POLLIN)
-            self._arrives_within = lambda seconds: bool(poll.poll(1000 * seconds))
+            self._readable_within = lambda seconds: bool(poll.poll(1000 * seconds))
 
     def wait(self) -> None:
         """
-        Wait until there is something to receive. Whether the death of a process closes its pipe depends on who else holds a
-        copy of that (a process that the worker has started, say), so a plain ``recv()`` could wait for ever.
+        Wait until there is a message to receive.
 
-        :raises EOFError: if the worker is dead and has left nothing
+        The death of a worker does not always close its pipe, since another process, such as one that the worker has started,
+        may hold a copy of it. A plain ``recv()`` could therefore wait for ever.
+
+        :raises EOFError: If the worker is dead and all its messages have been received
         """
-        while not self._arrives_within(1.0):
-            if not self._process.is_alive() and not self._arrives_within(0.0):
+        while not self._readable_within(1.0):
+            # The worker may have sent its last message after the first call and then died, hence the second call
+            if not self._process.is_alive() and not self._readable_within(0.0):
                 raise EOFError

@@ -1,4 +1,4 @@
-"""Random streams: every agent draws from generators of its own, although SB3 draws from the global ones."""
+"""Random number generators of each agent's own, although SB3 draws from the global ones."""
 
 import random
 
@@ -9,62 +9,74 @@ from numpy.random import mtrand
 
 class RngState:
     """
-    What one party draws from: a state of each of the global generators that SB3 draws from (torch's on the CPU and on every
-    CUDA device in use, numpy's). Only one stream is the current one; ``suspend`` and ``resume`` exchange them.
+    State of the global generators from which SB3 draws: numpy's, and torch's on the CPU and on every CUDA device in use.
 
-    numpy's global generator is exchanged as an object, since reading its state takes about 100 times as long. The only thing
-    lost by that is the second normal number that ``np.random.normal`` keeps back: it is drawn anew after an exchange.
+    ``resume`` puts the state into the global generators and ``suspend`` takes it from them, so at most one ``RngState`` is
+    current at a time.
 
-    :param seed: where the stream starts; None: from the operating system's entropy
+    numpy's global generator is exchanged as an object, because reading its state takes about 100 times as long. The object
+    does not hold the second normal number that ``np.random.normal`` keeps for its next call, so that number is drawn anew
+    after an exchange.
+
+    :param seed: Seed of all generators. None to take one from the operating system's entropy
     """
 
     def __init__(self, seed: int | None = None):
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         self._numpy = np.random.MT19937()
-        # As np.random.seed() does it: a model that seeds itself and one that does not draw the same numbers for the same seed
+        # np.random.seed() seeds in the same way, so a model draws the same numbers whether or not it seeds numpy itself
         self._numpy._legacy_seeding(seed)
         self._torch = th.Generator().manual_seed(seed).get_state()
-        #: For ``RngSwitch``: what Python's generator starts from where this stream is the first
+        #: State of Python's generator. ``RngSwitch`` uses it, and only that of the ``RngState`` that it starts with
         self.python = random.Random(seed).getstate()
         self._cuda: list[th.Tensor] = []
 
     def resume(self) -> None:
-        """Make this the current stream."""
+        """Make this the current state, from which SB3 draws."""
         th.default_generator.set_state(self._torch)
         mtrand.set_bit_generator(self._numpy)
         if self._cuda:
             th.cuda.set_rng_state_all(self._cuda)
 
     def suspend(self) -> None:
-        """Note how far this stream, the current one, has come."""
+        """Store how far the global generators have advanced since this state was resumed."""
+        # numpy's generator is this object's own and has advanced in place, so there is nothing to store
         self._torch = th.default_generator.get_state()
+        # Asking for the state of a CUDA device would initialise CUDA in a process that does not use it
         if th.cuda.is_initialized():
             self._cuda = th.cuda.get_rng_state_all()
 
     def become(self, other: "RngState") -> None:
         """
-        :param other: where this one is from now on; neither is the current one
+        Take over the state of another one. Neither of the two may be current.
+
+        Only numpy's generator and torch's on the CPU are taken over, which are those of an agent that learns in a worker.
+
+        :param other: State to take over
         """
         self._torch, self._numpy = other._torch, other._numpy
 
 
 class RngSwitch:
     """
-    Lends the global generators to one stream after another, as a context manager that puts the caller's own state back.
+    Context manager in which the global generators switch between several states.
 
-    Python's generator, whose state is slow to exchange and which no algorithm of SB3 draws from, is lent once, to the first
-    stream: environments and callbacks of a team share it.
+    At its end the caller's own state is restored.
 
-    :param stream: who draws at the beginning
+    Python's generator is slow to exchange and no algorithm of SB3 draws from it. It therefore uses the state of the first
+    ``RngState`` throughout, which a team's environments and callbacks share.
+
+    :param rng: The first state, current when the context begins
     """
 
-    def __init__(self, stream: RngState):
-        self._first = stream
-        self._current = stream
+    def __init__(self, rng: RngState):
+        self._first = rng
+        self._current = rng
 
     def __enter__(self) -> "RngSwitch":
-        # The caller may hold back a normal number in numpy's generator, so its state is read in full
+        # The caller's numpy generator may keep a normal number for its next call, which the generator object does not hold.
+        # Its state is therefore read in full, which is slow but happens only once
         self._callers = RngState(0)
         self._callers.suspend()
         self._callers_python = random.getstate()
@@ -83,11 +95,13 @@ class RngSwitch:
         mtrand.set_bit_generator(bit_generator)
         np.random.set_state(state)
 
-    def to(self, stream: RngState) -> None:
+    def to(self, rng: RngState) -> None:
         """
-        :param stream: who draws from now on
+        Switch to another state.
+
+        :param rng: The state that is current from now on
         """
-        if stream is not self._current:
+        if rng is not self._current:
             self._current.suspend()
-            stream.resume()
-            self._current = stream
+            rng.resume()
+            self._current = rng

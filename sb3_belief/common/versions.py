@@ -1,4 +1,4 @@
-"""The versions that a result or a saved file depends on."""
+"""Versions of the packages on which results and saved files depend."""
 
 import platform
 from importlib import metadata
@@ -11,9 +11,11 @@ _PACKAGES = ("stable-baselines3", "sb3-contrib", "torch", "gymnasium", "pettingz
 
 def versions() -> dict[str, str]:
     """
-    :return: {name: version} of Python, this package and those that it builds on
+    Return the versions of Python, this package and the packages that it builds on.
+
+    :return: {name: version}
     """
-    # from the package itself: a checkout that is run in place is not known to pip
+    # This package's own version is not asked from pip, which does not know a checkout that is run in place
     found = {"python": platform.python_version(), "sb3-belief": __version__}
     for package in _PACKAGES:
         try:
