@@ -16,7 +16,7 @@ TRAFFIC = {"reward_scale": 0.1}
 
 
 def success_rate(team: Any) -> float:
-    """Return the share of episodes without a collision, of 256 that training does not see. Without brakes it is 1/4."""
+    """Return the share of episodes without a collision, of 256 that training does not see. Without braking it is 1/4."""
     env = make_team_env("traffic-junction-easy", n_envs=32, seed=1000, env_kwargs=TRAFFIC)
     successes = []
 
