@@ -1,1 +1,1 @@
-"""Pictures of what was learned."""
+"""Plots of training runs."""

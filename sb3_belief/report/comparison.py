@@ -1,4 +1,4 @@
-"""Learning curves of several runs beside each other."""
+"""Learning curves of several runs in one plot."""
 
 import itertools
 import os
@@ -7,22 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_belief.report.learning_curve import INK, QUANTITIES, new_axes, read_episodes, save
+from sb3_belief.report.learning_curve import INK, QUANTITIES, new_axes, read_episodes, save_figure
 
 COLOURS = ("#1f6f8b", "#c8553d", "#7a8b3c", "#6b5b95", "#b8860b", "#555555")
 
 
 def binned(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """
-    :param steps: joint steps after which each episode ended, [k]
-    :param values: of these episodes, [k]
-    :param edges: borders of the bins, rising, [n + 1]
-    :return: mean of each bin's episodes, [n]; NaN where none ended
+    Return the mean value of the episodes that ended in each bin of joint steps.
+
+    :param steps: Joint steps after which each episode ended, ``[k]``
+    :param values: Values of these episodes, ``[k]``
+    :param edges: Edges of the bins in ascending order, ``[n + 1]``. A bin includes its right edge
+    :return: Mean of each bin, ``[n]``. NaN for a bin in which no episode ended
     """
-    places = np.digitize(steps, edges, right=True) - 1
-    inside = (places >= 0) & (places < len(edges) - 1)
-    counts = np.bincount(places[inside], minlength=len(edges) - 1)
-    sums = np.bincount(places[inside], weights=values[inside], minlength=len(edges) - 1)
+    bins = np.digitize(steps, edges, right=True) - 1
+    inside = (bins >= 0) & (bins < len(edges) - 1)
+    counts = np.bincount(bins[inside], minlength=len(edges) - 1)
+    sums = np.bincount(bins[inside], weights=values[inside], minlength=len(edges) - 1)
+    # 0 / 0 is NaN, which matplotlib draws as a gap
     with np.errstate(invalid="ignore"):
         return sums / counts
 
@@ -35,17 +38,19 @@ def plot_comparison(
     title: str = "",
 ) -> Path:
     """
-    Draw what was earned while learning: the mean over the runs of each name as a line, from the lowest to the highest run as
-    a band.
+    Plot the learning curves of groups of runs.
 
-    :param runs: {name: folders of its runs}
-    :param output: picture to write; the ending says which format
-    :param quantity: ``"return"`` or ``"success"``
-    :param n_bins: into how many parts the joint steps are cut; each episode counts in the part in which it ended
-    :param title: what stands above
-    :return: the picture's path
-    :raises ImportError: if matplotlib is not installed
-    :raises ValueError: for another quantity, or if a run has not finished an episode or tells no successes
+    Each group has a line, the mean over its runs, and a band from its lowest to its highest run.
+
+    :param runs: {name of the group: folders of its runs}
+    :param output: Image file to write. Its suffix selects the format
+    :param quantity: What to plot, ``"return"`` or ``"success"``
+    :param n_bins: Number of bins into which the joint steps are divided. An episode counts in the bin in which it ended
+    :param title: Title of the plot
+    :return: Path of the image
+    :raises ImportError: If matplotlib is not installed
+    :raises ValueError: For another quantity, or if a run has finished no episode, or reports no successes although
+        ``quantity`` is ``"success"``
     """
     if quantity not in QUANTITIES:
         raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
@@ -54,7 +59,7 @@ def plot_comparison(
         curves[name] = [read_episodes(folder) for folder in folders]
         for folder, (_, _, successes) in zip(folders, curves[name], strict=True):
             if quantity == "success" and np.isnan(successes).any():
-                raise ValueError(f"{os.fspath(folder)!r} tells no successes; draw quantity='return'.")
+                raise ValueError(f"{os.fspath(folder)!r} reports no successes; draw quantity='return'.")
 
     figure, axes = new_axes(title, quantity)
     edges = np.linspace(0, max(steps[-1] for runs_of in curves.values() for steps, _, _ in runs_of), n_bins + 1)
@@ -65,4 +70,4 @@ def plot_comparison(
         axes.fill_between(middles, rows.min(axis=0), rows.max(axis=0), color=colour, alpha=0.15, lw=0)
     axes.set_xlim(0, edges[-1])
     axes.legend(frameon=False, loc="best", fontsize=9, labelcolor=INK)
-    return save(figure, output)
+    return save_figure(figure, output)

@@ -1,4 +1,4 @@
-"""The learning curve of one run."""
+"""Learning curve of one run."""
 
 import os
 from collections.abc import Mapping
@@ -8,37 +8,38 @@ from typing import Any
 import numpy as np
 
 INK, CURVE, GREEDY = "#333333", "#1f6f8b", "#c8553d"
-#: What a curve may show, and how its axis says so
+#: The quantities that a curve can show, with the labels of their axes
 QUANTITIES = {"return": "team return per episode", "success": "success rate"}
 
 
 def read_monitor(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Read the team's ``monitor.csv``.
+    Read the episodes in the team's ``monitor.csv``.
 
-    :param folder: a run's folder
-    :return: joint steps after which each episode ended (float [k], summed over copies), team returns [k], and successes [k]
-        (0 or 1, or NaN where the environment does not say)
-    :raises FileNotFoundError: if the run has no monitor file
+    :param folder: Folder of a run
+    :return: Joint steps after which each episode ended (float ``[k]``, summed over the copies), team returns ``[k]`` and
+        successes ``[k]`` (0 or 1, or NaN if the environment does not report them)
+    :raises FileNotFoundError: If the run has no monitor file
     """
-    # pandas, which SB3's own reader needs, is not worth a dependency for one file of numbers
+    # SB3's own reader needs pandas, which is too large a dependency for one file of numbers
     lines = (Path(folder) / "monitor.csv").read_text(encoding="utf-8").splitlines()
+    # The first line is a comment with SB3's metadata
     names = lines[1].split(",")
     rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[2:]]
     lengths = np.array([float(row["l"]) for row in rows])
     returns = np.array([float(row["r"]) for row in rows])
-    says = {"True": 1.0, "False": 0.0}
-    successes = np.array([says.get(row.get("is_success", ""), np.nan) for row in rows])
+    numbers = {"True": 1.0, "False": 0.0}
+    successes = np.array([numbers.get(row.get("is_success", ""), np.nan) for row in rows])
     return np.cumsum(lengths), returns, successes
 
 
 def read_evaluations(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """
-    Read ``evaluations.npz``, what SB3's ``EvalCallback`` wrote.
+    Read ``evaluations.npz``, which SB3's ``EvalCallback`` writes.
 
-    :param folder: a run's folder
-    :return: joint steps [k], mean returns [k] and success rates [k] (NaN where the environment does not say) of the greedy
-        team, or None if it was never evaluated
+    :param folder: Folder of a run
+    :return: Joint steps ``[k]``, mean returns ``[k]`` and success rates ``[k]`` (NaN if the environment does not report
+        them) of the team when it acts greedily. None if it was never evaluated
     """
     path = Path(folder) / "evaluations.npz"
     if not path.is_file():
@@ -51,9 +52,11 @@ def read_evaluations(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.nda
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
     """
-    :param values: [k]
-    :param window: number of values, at least 1
-    :return: mean of each value and the ``window - 1`` before it [k]; over fewer at the beginning
+    Return the moving average of a series.
+
+    :param values: The series, ``[k]``
+    :param window: Number of values to average, at least 1
+    :return: Mean of each value and the ``window - 1`` before it, ``[k]``. At the beginning the mean is over fewer values
     """
     sums = np.cumsum(np.concatenate([[0.0], values]))
     ends = np.arange(1, len(values) + 1)
@@ -63,9 +66,12 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    :param folder: a run's folder
-    :return: as ``read_monitor``
-    :raises ValueError: if the run has not finished an episode
+    Read the episodes of a run and check that there are any.
+
+    :param folder: Folder of a run
+    :return: As of ``read_monitor``
+    :raises FileNotFoundError: If the run has no monitor file
+    :raises ValueError: If the run has finished no episode
     """
     steps, returns, successes = read_monitor(folder)
     if not len(steps):
@@ -75,16 +81,18 @@ def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarra
 
 def new_axes(title: str, quantity: str) -> tuple[Any, Any]:
     """
-    :param title: what stands above
-    :param quantity: what the y axis shows, a key of ``QUANTITIES``
-    :return: matplotlib's figure and axes for curves over joint steps
-    :raises ImportError: if matplotlib is not installed
+    Make an empty plot for curves over joint steps.
+
+    :param title: Title of the plot, or an empty string for none
+    :param quantity: What the y axis shows, a key of ``QUANTITIES``
+    :return: Figure and axes of matplotlib
+    :raises ImportError: If matplotlib is not installed
     """
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError("Plots need matplotlib: pip install 'sb3-belief[plots]'.") from error
-    # not pyplot: no global state and no backend, so it draws on any machine
+    # pyplot has global state and needs a backend. A figure of its own draws on machines without a screen too
     figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel("joint steps of the team")
@@ -99,11 +107,13 @@ def new_axes(title: str, quantity: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def save(figure: Any, output: str | os.PathLike[str]) -> Path:
+def save_figure(figure: Any, output: str | os.PathLike[str]) -> Path:
     """
-    :param figure: matplotlib's
-    :param output: picture to write; folders that are missing are made
-    :return: its path
+    Write a figure to an image file.
+
+    :param figure: Figure of matplotlib
+    :param output: Image file to write. Its folder is created if necessary
+    :return: Path of the image
     """
     path = Path(output)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -118,26 +128,27 @@ def plot_learning_curve(
     title: str = "",
 ) -> Path:
     """
-    Draw success rate (or return, where the environment tells no successes) over joint steps.
+    Plot a run's success rate over joint steps, or its return if the environment does not report successes.
 
-    :param folder: a run's folder
-    :param output: picture to write; the ending says which format
-    :param bars: {name: value} to draw as horizontal lines, in the unit of the y axis
-    :param title: what stands above
-    :return: the picture's path
-    :raises ImportError: if matplotlib is not installed
-    :raises ValueError: if the run has not finished an episode
+    :param folder: Folder of the run
+    :param output: Image file to write. Its suffix selects the format
+    :param bars: {name: value} of horizontal lines to compare with, in the unit of the y axis
+    :param title: Title of the plot
+    :return: Path of the image
+    :raises ImportError: If matplotlib is not installed
+    :raises ValueError: If the run has finished no episode
     """
     steps, returns, successes = read_episodes(folder)
-    tells_success = not np.isnan(successes).any()
-    values = successes if tells_success else returns
+    has_successes = not np.isnan(successes).any()
+    values = successes if has_successes else returns
+    # A tenth of the run, so that short runs show a trend too
     window = max(1, min(500, len(values) // 10))
 
-    figure, axes = new_axes(title, "success" if tells_success else "return")
+    figure, axes = new_axes(title, "success" if has_successes else "return")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
     evaluations = read_evaluations(folder)
     if evaluations is not None:
-        greedy = evaluations[2] if tells_success else evaluations[1]
+        greedy = evaluations[2] if has_successes else evaluations[1]
         axes.plot(evaluations[0], greedy, color=GREEDY, marker="o", ms=4.5, lw=1.2, label="greedy, on other episodes")
     for name, value in (bars or {}).items():
         axes.axhline(value, color=INK, lw=0.9, ls=(0, (5, 4)), alpha=0.6, zorder=0)
@@ -153,4 +164,4 @@ def plot_learning_curve(
         )
     axes.set_xlim(0, steps[-1])
     axes.legend(frameon=False, loc="best", fontsize=9)
-    return save(figure, output)
+    return save_figure(figure, output)

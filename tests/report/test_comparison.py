@@ -38,14 +38,14 @@ def test_lines_are_means_over_runs_and_bands_go_from_lowest_to_highest(tmp_path,
     assert axes.get_ylabel() == "team return per episode" and axes.get_title(loc="left") == "Two games"
 
 
-def test_successes_are_drawn_where_they_are_told(tmp_path):
+def test_successes_are_drawn_where_they_are_reported(tmp_path):
     pytest.importorskip("matplotlib")
-    told, silent = write_run(tmp_path / "told", [0, 0]), write_run(tmp_path / "silent", [0, 0], success="")
-    assert plot_comparison({"a": [told]}, tmp_path / "sub" / "a.png", "success").is_file()
-    with pytest.raises(ValueError, match=r"silent.*tells no successes; draw quantity='return'"):
+    reported, silent = write_run(tmp_path / "reported", [0, 0]), write_run(tmp_path / "silent", [0, 0], success="")
+    assert plot_comparison({"a": [reported]}, tmp_path / "sub" / "a.png", "success").is_file()
+    with pytest.raises(ValueError, match=r"silent.*reports no successes; draw quantity='return'"):
         plot_comparison({"a": [silent]}, tmp_path / "b.png", "success")
     with pytest.raises(ValueError, match="quantity is 'wins'; it must be one of 'return', 'success'"):
-        plot_comparison({"a": [told]}, tmp_path / "b.png", "wins")
+        plot_comparison({"a": [reported]}, tmp_path / "b.png", "wins")
 
 
 def test_a_run_without_an_episode_is_refused(tmp_path):

@@ -19,7 +19,7 @@ def test_monitor_counts_joint_steps_and_successes(tmp_path):
     assert successes.tolist() == [1, 0, 1]
 
 
-def test_an_environment_may_tell_no_successes(tmp_path):
+def test_an_environment_may_report_no_successes(tmp_path):
     (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,\n")
     assert np.isnan(read_monitor(tmp_path)[2]).all()
     assert read_evaluations(tmp_path) is None
