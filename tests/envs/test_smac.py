@@ -4,11 +4,9 @@ packages, where these are installed.
 """
 
 import copy
-import inspect
 import random
 import warnings
 from functools import partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -16,48 +14,18 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
-from sb3_belief.envs.adapters import smac, smacv2
+from sb3_belief.envs.adapters import smacv2
 from tests.envs import fake_starcraft
+from tests.envs.smac_helpers import MAKERS, hide, make, make_team_env, make_v2, near_the_limit, random_play, still
 from tests.envs.tuple_families import check_advantages, train_save_load_evaluate
 
-make: Any = smac.make
-make_v2: Any = smacv2.make
-make_team_env: Any = team.make_team_env
 Team: Any = team.Team
-MAKERS = [partial(make, "3m"), partial(make, "2s3z"), partial(make_v2, "protoss_5_vs_5"), partial(make_v2, "zerg_10_vs_11")]
 
 
 @pytest.fixture
 def faults():
     with fake_starcraft.installed() as installed:
         yield installed
-
-
-def random_play(env, generator, act=None):
-    masks = {agent: env._masks[i] for i, agent in enumerate(env.possible_agents)}
-    chosen = {agent: int((generator.random(mask.shape) * mask).argmax()) for agent, mask in masks.items()}
-    return env.step({**chosen, **(act or {})})
-
-
-def near_the_limit(env, steps_left):
-    """
-    Go on as if only so many steps were left.
-    """
-    game = getattr(env.game, "env", env.game)
-    game._episode_steps = game.episode_limit - steps_left
-
-
-def hide(env):
-    """
-    Put everybody so far apart that a battle never ends.
-    """
-    for side, x in ((env.game.agents, 2.0), (env.game.enemies, 30.0)):
-        for unit in side.values():
-            unit.pos.x = x
-
-
-def still(env):
-    return {agent: 0 if env._masks[i, 0] else 1 for i, agent in enumerate(env.possible_agents)}
 
 
 @pytest.mark.parametrize("maker", MAKERS)
@@ -186,93 +154,6 @@ def battle_of_five_steps(is_won):
 def test_limits_are_bootstrapped_and_battles_that_are_over_are_not(faults, is_won):
     ends = check_advantages(partial(battle_of_five_steps, is_won), lambda last: is_won, 16, MaskableBeliefPPO)
     assert len(ends) == 3 * 2 * 3  # agents, copies, battles
-
-
-@pytest.mark.parametrize("maker", MAKERS)
-@pytest.mark.parametrize("first_battle", [True, False])
-def test_a_lost_connection_truncates_and_the_next_battle_begins(faults, maker, first_battle):
-    env = maker()
-    env.reset(seed=0)
-    generator = np.random.default_rng(0)
-    if not first_battle:
-        near_the_limit(env, 1)
-        random_play(env, generator)
-        env.reset()
-    observations = random_play(env, generator)[0]
-    faults.lost_steps.add(faults.n_steps + 1)
-    calls = faults.obs_calls
-    with pytest.warns(UserWarning, match="lost its connection"):
-        last, rewards, terminations, truncations, infos = random_play(env, generator)
-    assert all(truncations.values()) and not any(terminations.values()) and not env.agents
-    # The units of the closed game are not asked, nobody says that the battle was lost, and nobody saw anything
-    assert faults.obs_calls == calls
-    for agent in env.possible_agents:
-        np.testing.assert_array_equal(last[agent], observations[agent])
-        assert "is_success" not in infos[agent] and rewards[agent] == 0.0
-    assert not any(row.any() for row in env.visibility().values())
-    env.reset()
-    random_play(env, generator)
-    assert env.agents and len(faults.running()) == 1
-
-
-def test_a_lost_connection_under_the_vectoriser(faults):
-    env = make_team_env(partial(make, "3m"), n_envs=2, seed=0)
-    env.reset()
-    faults.lost_steps.add(2)
-    stop = {agent: np.ones(2, dtype=int) for agent in env.possible_agents}
-    with pytest.warns(UserWarning, match="lost its connection"):
-        _, _, dones, infos = env.step(stop)
-    assert dones.tolist() == [False, True]
-    assert infos[1]["TimeLimit.truncated"] is True and infos[1]["truncated"].all() and "is_success" not in infos[1]
-    assert env.step(stop)[2].tolist() == [False, False]
-
-
-def test_no_starcraft_is_left_behind(faults):
-    env = make("3m")
-    env.reset(seed=0)
-    # SMAC would launch another one at each reset before its first battle is over
-    for _ in range(3):
-        env.step(still(env))
-        env.reset()
-        assert len(faults.running()) == 1
-    hide(env)
-    near_the_limit(env, 1)
-    env.step(still(env))
-    launched = len(faults.processes)
-    env.reset()
-    env.step(still(env))
-    env.reset()
-    assert len(faults.processes) == launched, "from then on it goes on with the one that runs"
-    env.reset(seed=5)
-    assert len(faults.running()) == 1 and faults.running()[0].seed == 5
-    env.close()
-    env.close()
-    assert not faults.running()
-    env.reset()
-    assert len(faults.running()) == 1
-
-
-@pytest.mark.parametrize("maker", MAKERS)
-def test_connections_lost_at_the_beginning_of_a_battle(faults, maker):
-    env = maker()
-    faults.lost_resets = 2
-    env.reset(seed=0)
-    assert all(unit.health > 0 for unit in env.game.agents.values()) and len(faults.running()) == 1
-    near_the_limit(env, 1)
-    env.step(still(env))
-    faults.lost_resets = 1
-    env.reset()
-    assert env.game._episode_steps == 0 and len(faults.running()) == 1
-    faults.lost_resets = 3
-    with pytest.raises(RuntimeError, match="3 battles"):
-        env.reset()
-
-
-def test_an_error_that_is_no_lost_connection_is_raised(faults, monkeypatch):
-    env = make("3m")
-    monkeypatch.setattr(env.game, "init_units", lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        env.reset()
 
 
 def test_reset_of_smacv2_that_returns_nothing(faults):
@@ -459,36 +340,3 @@ def test_a_team_learns_is_saved_and_evaluated(faults, tmp_path, env_id):
     # Without masks it chooses what the game would not take
     with pytest.raises(ValueError, match="heeds action masks"):
         Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=64).learn(128)
-
-
-def parameters(function):
-    return list(inspect.signature(function).parameters)
-
-
-METHODS = (
-    "reset step get_obs get_obs_agent get_obs_size get_state get_state_size get_avail_actions get_avail_agent_actions"
-    " get_total_actions get_env_info get_visibility_matrix get_obs_move_feats_size get_obs_enemy_feats_size"
-    " get_obs_ally_feats_size get_obs_own_feats_size get_unit_by_id unit_sight_range full_restart render close seed"
-    " save_replay get_stats"
-).split()
-
-
-@pytest.mark.skipif(find_spec("smac") is None, reason="SMAC is not installed: its interface is compared where it is")
-def test_the_fake_has_the_interface_of_the_real_smac():
-    from smac.env import StarCraft2Env
-
-    assert parameters(fake_starcraft.StarCraft2Env) == parameters(StarCraft2Env)
-    for name in METHODS:
-        assert parameters(getattr(fake_starcraft.StarCraft2Env, name)) == parameters(getattr(StarCraft2Env, name)), name
-
-
-@pytest.mark.skipif(find_spec("smacv2") is None, reason="SMACv2 is not installed: its interface is compared where it is")
-def test_the_fake_has_the_interface_of_the_real_smacv2():
-    from smacv2.env.starcraft2.starcraft2 import StarCraft2Env
-    from smacv2.env.starcraft2.wrapper import StarCraftCapabilityEnvWrapper
-
-    fake = set(parameters(fake_starcraft.StarCraft2EnvV2)) | set(parameters(fake_starcraft.StarCraft2Env))
-    assert fake - {"kwargs"} == set(parameters(StarCraft2Env))
-    for name in METHODS:
-        assert hasattr(StarCraft2Env, name), name
-    assert parameters(fake_starcraft.StarCraftCapabilityEnvWrapper) == parameters(StarCraftCapabilityEnvWrapper)
