@@ -1,4 +1,4 @@
-"""Train a team: ``python train.py --algo belief_ppo --env traffic-junction-medium``. The same as ``sb3-belief train``."""
+"""Train a team, as ``sb3-belief train`` does: ``python train.py --algo belief_ppo --env traffic-junction-medium``."""
 
 import sys
 

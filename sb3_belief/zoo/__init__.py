@@ -1,4 +1,4 @@
-"""From a few lines of YAML to a run on disk: training, replaying, and the demo."""
+"""Training from YAML: runs on disk, their replay, the command line and the demo."""
 
 from sb3_belief.zoo.rl_zoo3 import register_rl_zoo3
 

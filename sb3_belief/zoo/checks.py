@@ -1,4 +1,9 @@
-"""Is a YAML value what an argument wants? Read from the signatures, so that no list of settings has to be kept."""
+"""
+Checks of YAML values against the arguments that they are for.
+
+The allowed keys and types are read from the signatures of algorithms, policies and environments, so no list of settings has to
+be kept up to date.
+"""
 
 import inspect
 import types
@@ -9,37 +14,44 @@ from typing import Any
 
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_belief.zoo.errors import ConfigError, unknown
+from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.names import resolve
 
 
 @dataclass(frozen=True)
-class Place:
+class Location:
     """
-    Where a value stands.
+    Source of a setting, which error messages begin with.
 
-    :param text: file and section, or flag
-    :param extra_packages: see ``names.resolve``
+    :param text: File and section, or flag, followed by the keys that lead to the setting
+    :param extra_packages: See ``names.resolve``
     """
 
     text: str
     extra_packages: tuple[str, ...] = ()
 
-    def key(self, name: str) -> "Place":
-        return Place(f"{self.text}: {name}", self.extra_packages)
+    def key(self, name: str) -> "Location":
+        """
+        Return the location of a nested setting.
+
+        :param name: Its key
+        :return: The location
+        """
+        return Location(f"{self.text}: {name}", self.extra_packages)
 
 
 class _Mismatch(Exception):
-    """The value is not of this type (another member of a union may take it)."""
+    """Raised if a value does not have a type. If the type is part of a union, the value may still have another one."""
 
 
-def parameters(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
+def accepted_arguments(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
     """
-    The arguments of a function or of a class's constructor. Where a constructor passes ``**kwargs`` on to its base class, the
-    base's arguments count too.
+    Return the arguments of a function or of a class's constructor.
 
-    :param function: class or function
-    :return: {argument: annotation} in order, and whether arguments beyond these may exist that the signature does not tell
+    A constructor with ``**kwargs`` is assumed to pass them to its base class, so the arguments of the base class count too.
+
+    :param function: Class or function
+    :return: {argument: annotation} in order, and whether there may be further arguments that no signature names
     """
     constructors = [function]
     if inspect.isclass(function):
@@ -62,99 +74,106 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     try:
         return typing.get_type_hints(function)
     except NameError:
-        # Names imported under TYPE_CHECKING only (SB3: "VecEnv"); the annotations of interest here are objects already
+        # Some annotations name what is imported under TYPE_CHECKING only (in SB3: "VecEnv") and cannot be resolved. Those of
+        # settings are objects and not strings
         return {name: hint for name, hint in function.__annotations__.items() if not isinstance(hint, str)}
 
 
 def check_call(
-    function: Callable[..., Any], given: Any, place: Place, skip: int = 0, reserved: Mapping[str, str] | None = None
+    function: Callable[..., Any], given: Any, location: Location, skip: int = 0, reserved: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """
-    Check keyword arguments against a signature.
+    Check keyword arguments against the signature of the function that takes them.
 
-    :param function: class or function to be called
-    :param given: what the YAML has for its keyword arguments
-    :param place: where that stands
-    :param skip: number of leading arguments that the caller passes itself
-    :param reserved: {argument: what to do instead} for arguments that are not to be given here
-    :return: the arguments as the function wants them: dotted paths resolved, schedules made
-    :raises ConfigError: for an unknown argument or a wrong type
+    :param function: Class or function to be called
+    :param given: Keyword arguments as the YAML gives them, or None for none
+    :param location: Where they are given
+    :param skip: Number of leading arguments that the caller passes itself
+    :param reserved: {argument: what to do instead} for arguments that must not be given here
+    :return: The arguments as the function takes them: classes in place of dotted paths, and schedules in place of strings
+        such as ``"lin_3e-4"``
+    :raises ConfigError: For an unknown argument or a wrong type
     """
     if given is None:
         given = {}
     if not isinstance(given, dict):
-        raise ConfigError(f"{place.text}: must be a mapping of arguments, not {given!r}.")
-    known, open_ended = parameters(function)
+        raise ConfigError(f"{location.text}: must be a mapping of arguments, not {given!r}.")
+    known, open_ended = accepted_arguments(function)
     reserved = reserved or {}
     allowed = {name: hint for name, hint in list(known.items())[skip:] if name not in reserved}
     result = {}
     for name, value in given.items():
         if name in reserved:
-            raise ConfigError(f"{place.text}: {name!r} cannot be set here: {reserved[name]}. Allowed: {', '.join(allowed)}.")
+            raise ConfigError(
+                f"{location.text}: {name!r} cannot be set here: {reserved[name]}. Allowed: {', '.join(allowed)}."
+            )
         if name not in allowed and not open_ended:
-            raise unknown(place.text, "key", name, allowed)
-        result[name] = check_value(value, allowed.get(name, Any), place.key(name))
+            raise unknown_setting(location.text, "key", name, allowed)
+        result[name] = check_value(value, allowed.get(name, Any), location.key(name))
     return result
 
 
-def check_value(value: Any, hint: Any, place: Place) -> Any:
+def check_value(value: Any, hint: Any, location: Location) -> Any:
     """
-    :param value: what the YAML has
-    :param hint: type annotation
-    :param place: where it stands
-    :return: the value as the annotation wants it
-    :raises ConfigError: if it does not fit
+    Check a value against a type annotation.
+
+    :param value: Value as the YAML gives it
+    :param hint: Type annotation
+    :param location: Where it is given
+    :return: The value converted to the annotated type, e.g. a schedule for ``"lin_3e-4"``
+    :raises ConfigError: If it does not have the type
     """
     try:
-        return _convert(value, hint, place)
+        return _convert(value, hint, location)
     except _Mismatch:
-        raise ConfigError(f"{place.text}: must be {describe(hint)}, not {value!r} ({type(value).__name__}).") from None
+        raise ConfigError(f"{location.text}: must be {describe(hint)}, not {value!r} ({type(value).__name__}).") from None
 
 
-def _convert(value: Any, hint: Any, place: Place) -> Any:
+def _convert(value: Any, hint: Any, location: Location) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any or hint is inspect.Parameter.empty or isinstance(hint, typing.TypeVar):
         return value
     if origin in (typing.Union, types.UnionType):
-        return _convert_union(value, args, place)
+        return _convert_union(value, args, location)
     if origin is typing.Literal:
         return _require(value, value in args)
     if hint in _SCALARS:
         return _SCALARS[hint](value)
     if origin is type or hint is type:
-        return _resolve_class(value, args[0] if args else object, place)
+        return _resolve_class(value, args[0] if args else object, location)
     container = origin or hint
     if container is Callable:
         return _schedule(value)
     if inspect.isclass(container) and issubclass(container, Mapping):
-        return _convert_mapping(value, args, place)
+        return _convert_mapping(value, args, location)
     if inspect.isclass(container) and issubclass(container, Sequence):
-        return _convert_sequence(value, container, args, place)
-    # an object (a noise, an environment, a space): not something that plain data can be
+        return _convert_sequence(value, container, args, location)
+    # Any other type is that of an object (an action noise, an environment, a space), which plain data cannot be
     raise _Mismatch
 
 
-def _convert_union(value: Any, members: tuple[Any, ...], place: Place) -> Any:
+def _convert_union(value: Any, members: tuple[Any, ...], location: Location) -> Any:
+    # The first member that fits decides: for "float | Schedule" a number stays a number
     for member in members:
         try:
-            return _convert(value, member, place)
+            return _convert(value, member, location)
         except _Mismatch:
             continue
     raise _Mismatch
 
 
-def _convert_mapping(value: Any, args: tuple[Any, ...], place: Place) -> dict[Any, Any]:
+def _convert_mapping(value: Any, args: tuple[Any, ...], location: Location) -> dict[Any, Any]:
     _require(value, isinstance(value, dict))
     inner = args[1] if len(args) == 2 else Any
-    return {key: check_value(item, inner, place.key(str(key))) for key, item in value.items()}
+    return {key: check_value(item, inner, location.key(str(key))) for key, item in value.items()}
 
 
-def _convert_sequence(value: Any, container: type, args: tuple[Any, ...], place: Place) -> Sequence[Any]:
+def _convert_sequence(value: Any, container: type, args: tuple[Any, ...], location: Location) -> Sequence[Any]:
     _require(value, isinstance(value, list))
     if container is tuple and args and args[-1] is not Ellipsis:
         _require(value, len(value) == len(args))
-        return tuple(_convert(item, inner, place) for item, inner in zip(value, args, strict=True))
-    items = [_convert(item, args[0] if args else Any, place) for item in value]
+        return tuple(_convert(item, inner, location) for item, inner in zip(value, args, strict=True))
+    items = [_convert(item, args[0] if args else Any, location) for item in value]
     return tuple(items) if container is tuple else items
 
 
@@ -165,7 +184,7 @@ def _require(value: Any, condition: bool) -> Any:
 
 
 def _int(value: Any) -> int:
-    # a bool is an int in Python, never in a configuration; 1e6 is a float in YAML
+    # In Python a bool is an int, but in a configuration true is not a number. 1e6 is a float in YAML
     _require(value, isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer())
     return int(value)
 
@@ -195,18 +214,20 @@ def _schedule(value: Any) -> LinearSchedule:
     return LinearSchedule(start, 0.0, 1.0)
 
 
-def _resolve_class(value: Any, base: Any, place: Place) -> type:
+def _resolve_class(value: Any, base: Any, location: Location) -> type:
     _require(value, isinstance(value, str))
-    found = resolve(value, place.text, place.extra_packages)
+    found = resolve(value, location.text, location.extra_packages)
     if not inspect.isclass(found) or (inspect.isclass(base) and not issubclass(found, base)):
-        raise ConfigError(f"{place.text}: {value!r} is not a subclass of {base.__module__}.{base.__name__}.")
+        raise ConfigError(f"{location.text}: {value!r} is not a subclass of {base.__module__}.{base.__name__}.")
     return found
 
 
 def describe(hint: Any) -> str:
     """
-    :param hint: type annotation
-    :return: what it allows, in the words of someone who writes YAML
+    Return what a type annotation allows, in words for the author of a YAML file.
+
+    :param hint: Type annotation
+    :return: Description that completes the sentence "must be ..."
     """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
@@ -232,7 +253,7 @@ _WORDS: dict[Any, str] = {
     int: "an integer",
     float: "a number",
     bool: "true or false",
-    str: "a text",
+    str: "a string",
     type(None): "null",
     None: "null",
 }

@@ -1,4 +1,4 @@
-"""The command line: ``sb3-belief train | enjoy | envs | demo``."""
+"""Command line: ``sb3-belief train | enjoy | envs | demo``."""
 
 import argparse
 import os
@@ -8,12 +8,14 @@ from collections.abc import Callable, Sequence
 from sb3_belief.zoo.errors import ConfigError
 
 _ALGO, _ENV = "belief_ppo", "traffic-junction-medium"
-_PAIRS = "key:value pairs; values are read as YAML, a dot names a nested key"
+_PAIRS = "key:value pairs; values are read as YAML, and a dot in a key stands for a nested one"
 
 
 def make_parser() -> argparse.ArgumentParser:
     """
-    :return: the parser of ``sb3-belief``
+    Make the parser of ``sb3-belief``.
+
+    :return: The parser
     """
     parser = argparse.ArgumentParser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | envs | demo")
@@ -24,9 +26,17 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-_STYLE: dict = {"formatter_class": argparse.ArgumentDefaultsHelpFormatter, "allow_abbrev": False}
+class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Help formatter that shows default values, except those that would tell the user nothing: None, lists and switches."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default is None or isinstance(action.default, bool | list):
+            return action.help
+        return super()._get_help_string(action)
 
 
+_STYLE: dict = {"formatter_class": _HelpFormatter, "allow_abbrev": False}
+# A flag with one or more words. If it is given again, its words are added
 _LIST: dict = {"nargs": "+", "action": "extend", "default": []}
 
 
@@ -42,92 +52,112 @@ def _positive_or_off(text: str) -> int:
 
 
 def _add_env_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"for the environment: {_PAIRS}")
+    parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"arguments of the environment: {_PAIRS}")
     parser.add_argument(
         "--allow-package",
         **_LIST,
         metavar="NAME",
-        help="further packages that may be imported: by dotted paths in the configuration, by an environment module:callable",
+        help="further packages from which dotted paths in the configuration and module:callable may import",
     )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
     _add_env_options(parser)
-    parser.add_argument("--device", default="auto", help="cpu, cuda, ... or auto")
+    parser.add_argument("--device", default="auto", help="device of all models: auto, cpu, cuda, ...")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--algo", help=f"algorithm of every agent (default: {_ALGO}, with -i the saved team's)")
+    parser.add_argument("--algo", help=f"algorithm of all agents (default: {_ALGO}, or with -i that of the saved team)")
     parser.add_argument(
-        "--env", help=f"id of the environment, see sb3-belief envs (default: {_ENV}, with -i the saved team's)"
+        "--env", help=f"id of the environment, see sb3-belief envs (default: {_ENV}, or with -i that of the saved team)"
     )
-    parser.add_argument("-n", "--n-timesteps", type=_positive, help="joint steps, instead of the configuration's")
-    parser.add_argument("--seed", type=int, help="of the team and its environments; left out: drawn and written down")
+    parser.add_argument("-n", "--n-timesteps", type=_positive, help="number of joint steps, instead of the configuration's")
+    parser.add_argument(
+        "--seed", type=int, help="seed of the team and its environments; if left out, one is drawn and recorded"
+    )
     parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
-    parser.add_argument("-tb", "--tensorboard-log", help="folder for TensorBoard")
-    parser.add_argument("--eval-freq", type=_positive_or_off, default=25_000, help="evaluate every N joint steps, -1: never")
-    parser.add_argument("--eval-episodes", type=_positive, default=100, help="episodes of an evaluation")
-    parser.add_argument("--n-eval-envs", type=_positive, default=50, help="environment copies of an evaluation")
-    parser.add_argument("--save-freq", type=_positive_or_off, default=-1, help="save every N joint steps, -1: at the end only")
+    parser.add_argument("-tb", "--tensorboard-log", help="folder of the TensorBoard logs")
+    parser.add_argument(
+        "--eval-freq", type=_positive_or_off, default=25_000, help="evaluate every N joint steps; -1 for never"
+    )
+    parser.add_argument("--eval-episodes", type=_positive, default=100, help="number of episodes of an evaluation")
+    parser.add_argument("--n-eval-envs", type=_positive, default=50, help="number of environment copies of an evaluation")
+    parser.add_argument(
+        "--save-freq", type=_positive_or_off, default=-1, help="save every N joint steps; -1 for only at the end"
+    )
     parser.add_argument("-params", **_LIST, metavar="K:V", help=f"settings: {_PAIRS}")
     parser.add_argument("-conf", "--conf-file", help="YAML file instead of zoo_configs/<algo>.yml")
     parser.add_argument(
-        "--vec-env", choices=["dummy", "subproc"], default="dummy", help="in this process, or a process per copy"
+        "--vec-env",
+        choices=["dummy", "subproc"],
+        default="dummy",
+        help="whether environment copies run in this process, or in a worker process each",
     )
-    parser.add_argument("--num-threads", type=_positive_or_off, default=1, help="threads of torch, -1 for torch's own choice")
+    parser.add_argument(
+        "--num-threads", type=_positive_or_off, default=1, help="number of torch's threads; -1 for torch's default"
+    )
     parser.add_argument(
         "--jobs",
         type=_positive,
         default=1,
-        help="processes in which the agents learn; the same is learned with any number",
+        help="number of processes in which agents with on-policy algorithms learn; the result is the same for any number",
     )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
-    parser.add_argument("-i", "--trained-agent", help="a run's folder or a team's zip to go on from")
-    parser.add_argument("--verbose", type=int, choices=[0, 1, 2], default=1, help="0 for silence, 1 for tables")
+    parser.add_argument("-i", "--trained-agent", help="folder of a run, or zip of a team, whose training is to be continued")
+    parser.add_argument(
+        "--verbose",
+        type=int,
+        choices=[0, 1, 2],
+        default=1,
+        help="0 for no output, 1 for the team's tables, 2 for those of the agents too",
+    )
     _add_common(parser)
 
 
 def _add_enjoy(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", help="a run's folder, or a team's zip in it")
+    parser.add_argument("run", help="folder of a run, or zip of a team in it")
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--episodes", type=_positive, default=1, help="stop after that many episodes")
-    length.add_argument("-n", "--n-timesteps", type=_positive, help="or after that many steps")
+    length.add_argument("--episodes", type=_positive, default=1, help="number of episodes to play")
+    length.add_argument("-n", "--n-timesteps", type=_positive, help="number of steps to play instead")
     manner = parser.add_mutually_exclusive_group()
-    manner.add_argument("--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily")
+    manner.add_argument(
+        "--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily (default)"
+    )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
-    parser.add_argument("--seed", type=int, default=0, help="of the environment")
-    parser.add_argument("--output", help="a .gif or .mp4 file; left out: a window")
-    parser.add_argument("--fps", type=_positive, help="frames per second of the file; left out: the environment's own")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the environment")
+    parser.add_argument("--output", help=".gif or .mp4 file to write; if left out, a window is opened")
+    parser.add_argument("--fps", type=_positive, help="frames per second of the file; if left out, the environment's own rate")
     _add_common(parser)
 
 
 def _add_envs(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(family=None)
+    # "sb3-belief envs" without a further word lists all
+    parser.set_defaults(suite=None)
     what = parser.add_subparsers(dest="what", metavar="list | check")
-    listing = what.add_parser("list", help="what there is, what is installed and what installs the rest", **_STYLE)
-    listing.add_argument("family", nargs="?", help="list all ids of this one")
-    check = what.add_parser("check", help="play an environment and say what it lacks for a team", **_STYLE)
+    listing = what.add_parser("list", help="list the environments, and how to install those that are missing", **_STYLE)
+    listing.add_argument("suite", nargs="?", help="suite of which all ids are listed (default: the first of each suite)")
+    check = what.add_parser("check", help="play an environment and report what it lacks for a team", **_STYLE)
     check.add_argument("env", help="id of the environment, or module:callable")
-    check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="how long to play")
-    check.add_argument("--seed", type=int, default=0, help="of the environment")
+    check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="number of steps to play")
+    check.add_argument("--seed", type=int, default=0, help="seed of the environment")
     _add_env_options(check)
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
     from sb3_belief.zoo.demo import EPISODES, TIMESTEPS
 
-    parser.add_argument("-n", "--n-timesteps", type=_positive, default=TIMESTEPS, help="joint steps to train for")
-    parser.add_argument("--episodes", type=_positive, default=EPISODES, help="episodes of each measurement")
-    parser.add_argument("--seed", type=int, default=0, help="of the team and its environments")
+    parser.add_argument("-n", "--n-timesteps", type=_positive, default=TIMESTEPS, help="number of joint steps to train for")
+    parser.add_argument("--episodes", type=_positive, default=EPISODES, help="number of episodes of each measurement")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the team and its environments")
     parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    The command ``sb3-belief``.
+    Run the command ``sb3-belief``.
 
-    :param argv: the words after the command's name; None: those of the process
-    :return: exit status: 0, 1 if an environment failed its check, 2 if something was refused, 130 after Ctrl-C
+    :param argv: The words after the name of the command. None for those of the process
+    :return: Exit status: 0, 1 if an environment failed its check, 2 if a setting was refused, 130 after Ctrl-C
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     args = make_parser().parse_args(argv)
@@ -137,10 +167,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def train_main(argv: Sequence[str] | None = None) -> int:
     """
-    The script ``train.py``, which is ``sb3-belief train``.
+    Run the script ``train.py``, which does the same as ``sb3-belief train``.
 
-    :param argv: the words after the script's name; None: those of the process
-    :return: exit status, as ``main``
+    :param argv: The words after the name of the script. None for those of the process
+    :return: Exit status, as of ``main``
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(prog="train.py", description="Train a team from a YAML configuration.", **_STYLE)
@@ -150,7 +180,8 @@ def train_main(argv: Sequence[str] | None = None) -> int:
 
 def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.Namespace, command: list[str]) -> int:
     if getattr(args, "allow_package", None) and os.getcwd() not in sys.path:
-        # Code of one's own may lie here, as for "python -m"; last, so that it hides no installed package
+        # The user's own code may be in the current folder, as with "python -m". The folder comes last, so that nothing in it
+        # hides an installed package
         sys.path.append(os.getcwd())
     try:
         return action(args, command)
@@ -162,7 +193,7 @@ def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.
         return 130
 
 
-# torch and Stable-Baselines3 take seconds to import: not for --help
+# The functions below import what they need themselves: torch and Stable-Baselines3 take seconds, which --help should not
 
 
 def _train(args: argparse.Namespace, command: list[str]) -> int:
@@ -198,12 +229,12 @@ def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
 
 
 def _envs(args: argparse.Namespace, _: list[str]) -> int:
-    from sb3_belief.zoo.envs import check_env, list_envs
+    from sb3_belief.zoo.envs import list_envs, print_env_check
 
     if args.what == "check":
-        fine = check_env(args.env, args.env_kwargs, args.n_timesteps, args.seed, tuple(args.allow_package))
-        return 0 if fine else 1
-    print(list_envs(args.family))
+        passed = print_env_check(args.env, args.env_kwargs, args.n_timesteps, args.seed, tuple(args.allow_package))
+        return 0 if passed else 1
+    print(list_envs(args.suite))
     return 0
 
 

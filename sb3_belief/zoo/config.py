@@ -1,8 +1,9 @@
 """
-From ``zoo_configs/<algo>.yml`` and the command line to one checked configuration.
+Loading and checking the configuration of a run, from ``zoo_configs/<algo>.yml`` and the command line.
 
-A file maps environment ids to settings; its section ``default`` lies under every other one. Each source of settings is checked
-by itself, before anything is made, so that a refusal can name the file, the section and the key.
+A file maps environment ids to settings. The settings of its section ``default`` hold for all environments, and the other
+sections override them. Each source of settings is checked before they are merged, so that an error message can name the file,
+the section and the key. Nothing is created before all of them have been checked.
 """
 
 import os
@@ -17,15 +18,15 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_belief.zoo.checks import Place, check_call, check_value, parameters
-from sb3_belief.zoo.errors import ConfigError, unknown
+from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_value
+from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.names import Algo, get_algo, get_env, load_env, resolve
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
 DEFAULT = "default"
 REPO_CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
 
-#: Settings of the run itself; every other key is an argument of the algorithm's constructor
+#: The settings of the run itself. Every other key is an argument of the algorithm's constructor
 RUN_KEYS: dict[str, Any] = {
     "n_envs": int,
     "n_timesteps": int,
@@ -37,7 +38,7 @@ RUN_KEYS: dict[str, Any] = {
     "env_kwargs": dict[str, Any],
     "callback": str | list[Any] | dict[str, Any] | None,
 }
-# Naming these anew replaces what a lower layer named, instead of adding to it
+# Settings that override those of a lower layer as a whole. Merging them as mappings would add a second wrapper to the first
 _REPLACED = ("env_wrapper", "visibility", "callback")
 
 _FLAGS = {
@@ -56,22 +57,22 @@ _POLICY_INTERNAL = dict.fromkeys(
 @dataclass(frozen=True)
 class RunConfig:
     """
-    All that a run needs to know, checked.
+    Checked configuration of a run.
 
-    :param algo: name of the algorithm
-    :param env_id: id of the environment
-    :param settings: the merged settings as plain data, what ``config.yml`` says
-    :param source: the file they come from
-    :param algo_class: the algorithm's class
-    :param policy: name of its policy
-    :param n_envs: number of environment copies
-    :param n_timesteps: joint steps to train for
-    :param normalize: for ``Team(normalize=...)``
-    :param env_kwargs: for ``make_team_env``
-    :param wrapper: for ``make_team_env``: the wrappers named by ``env_wrapper``, or None
-    :param visibility: for ``make_team_env``: the function named by ``visibility``, or None
-    :param callbacks: callback classes and their arguments
-    :param algo_kwargs: constructor arguments of each agent's algorithm
+    :param algo: Name of the algorithm
+    :param env_id: Id of the environment
+    :param settings: The merged settings as plain data, which are written to ``config.yml``
+    :param source: Path of the file that they come from
+    :param algo_class: Class of the algorithm
+    :param policy: Name of its policy
+    :param n_envs: Number of environment copies, at least 1
+    :param n_timesteps: Number of joint steps to train for, at least 1
+    :param normalize: Argument of ``Team``
+    :param env_kwargs: Argument of ``make_team_env``
+    :param wrapper: Argument of ``make_team_env``: a function that applies the wrappers of ``env_wrapper``, or None
+    :param visibility: Argument of ``make_team_env``: the function that ``visibility`` names, or None
+    :param callbacks: Callback classes and their arguments
+    :param algo_kwargs: Constructor arguments of each agent's algorithm
     """
 
     algo: str
@@ -91,7 +92,9 @@ class RunConfig:
 
     def to_yaml(self) -> str:
         """
-        :return: a configuration file that reproduces the run with ``--conf-file``
+        Return the settings as a configuration file, which reproduces the run with ``--conf-file``.
+
+        :return: YAML
         """
         return yaml.safe_dump({self.env_id: self.settings}, sort_keys=False)
 
@@ -106,15 +109,20 @@ def load_config(
     extra_packages: tuple[str, ...] = (),
 ) -> RunConfig:
     """
-    :param algo: name of the algorithm (``names.ALGOS``)
-    :param env_id: id of the environment: a registered one, ``family/name`` or ``module:callable``
+    Load, merge and check the settings of a run.
+
+    Later sources override earlier ones: the file's section ``default``, its section of the environment, ``params``,
+    ``env_kwargs``, ``n_timesteps``.
+
+    :param algo: Name of the algorithm, a key of ``names.ALGOS``
+    :param env_id: Registered id, ``suite/name`` or ``module:callable`` of the environment
     :param conf_file: YAML file to read instead of ``zoo_configs/<algo>.yml``
-    :param params: ``key:value`` pairs that win over the file
-    :param env_kwargs: ``key:value`` pairs for the environment
-    :param n_timesteps: joint steps, instead of the file's
-    :param extra_packages: see ``names.resolve``
-    :return: the merged and checked configuration
-    :raises ConfigError: for whatever does not fit, naming its place, what is allowed and the nearest match
+    :param params: ``key:value`` pairs of settings
+    :param env_kwargs: ``key:value`` pairs of arguments of the environment
+    :param n_timesteps: Number of joint steps to train for, or None for the file's
+    :param extra_packages: See ``names.resolve``
+    :return: The configuration
+    :raises ConfigError: For a setting that does not fit. The message names its location, what is allowed and the nearest match
     """
     chosen = get_algo(algo)
     make_env = load_env(env_id, "--env", extra_packages)
@@ -124,26 +132,27 @@ def load_config(
         if name != DEFAULT:
             get_env(name, str(path))
     if not sections.keys() & {env_id, DEFAULT}:
-        there = ", ".join(sections) or "none"
-        raise ConfigError(f"{path}: has no section {env_id!r} and no section {DEFAULT!r}; it has {there}.")
+        existing = ", ".join(sections) or "none"
+        raise ConfigError(f"{path}: has no section {env_id!r} and no section {DEFAULT!r}; it has {existing}.")
 
-    layers: list[tuple[Place, Any]] = [
-        (Place(f"{path}, section {name}", extra_packages), sections[name]) for name in (DEFAULT, env_id) if name in sections
+    layers: list[tuple[Location, Any]] = [
+        (Location(f"{path}, section {name}", extra_packages), sections[name]) for name in (DEFAULT, env_id) if name in sections
     ]
-    layers.append((Place("-params", extra_packages), parse_pairs(params, "-params")))
-    layers.append((Place("--env-kwargs", extra_packages), {"env_kwargs": parse_pairs(env_kwargs, "--env-kwargs")}))
+    layers.append((Location("-params", extra_packages), parse_pairs(params, "-params")))
+    layers.append((Location("--env-kwargs", extra_packages), {"env_kwargs": parse_pairs(env_kwargs, "--env-kwargs")}))
     if n_timesteps is not None:
-        layers.append((Place("--n-timesteps", extra_packages), {"n_timesteps": n_timesteps}))
+        layers.append((Location("--n-timesteps", extra_packages), {"n_timesteps": n_timesteps}))
 
-    for place, layer in layers:
+    for location, layer in layers:
         if layer is not None and not isinstance(layer, dict):
-            raise ConfigError(f"{place.text}: must be a mapping of settings, not {layer!r}.")
+            raise ConfigError(f"{location.text}: must be a mapping of settings, not {layer!r}.")
     checker = _LayerChecker(chosen, make_env, len(get_env(env_id, "--env").leading), _policy_name(layers))
     settings: dict[str, Any] = {}
     checked: dict[str, Any] = {}
-    for place, layer in layers:
-        checked = _put_over(checked, checker.check(layer or {}, place))
-        settings = _put_over(settings, layer or {})
+    # The plain data is merged as well, because config.yml is written from it
+    for location, layer in layers:
+        checked = _override(checked, checker.check(layer or {}, location))
+        settings = _override(settings, layer or {})
     if not settings["env_kwargs"]:
         del settings["env_kwargs"]
     for key in ("policy", "n_timesteps"):
@@ -154,16 +163,20 @@ def load_config(
 
 def find_config_file(algo: str, conf_file: str | None = None) -> Path:
     """
-    :param algo: name of the algorithm
-    :param conf_file: what the user gave, if anything
-    :return: that file; else the one of the checkout; else the one that was installed with the package
-    :raises ConfigError: if there is none
+    Return the configuration file to read.
+
+    :param algo: Name of the algorithm
+    :param conf_file: File that the user gave, or None
+    :return: The given file, otherwise the algorithm's file in the checkout, otherwise the one installed with the package
+    :raises ConfigError: If there is none
     """
     if conf_file is not None:
         if not Path(conf_file).is_file():
             raise ConfigError(f"--conf-file: no file {conf_file!r}.")
         return Path(conf_file)
     candidates = [REPO_CONFIGS / f"{algo}.yml"]
+    # Outside a checkout the files are data files of the distribution. They are installed beside the package, at a path with
+    # ".." that only the distribution's metadata knows
     try:
         installed = metadata.files("sb3-belief") or []
         candidates += [
@@ -173,28 +186,28 @@ def find_config_file(algo: str, conf_file: str | None = None) -> Path:
         pass
     for candidate in candidates:
         if candidate.is_file():
-            # short where possible: it stands in every message
+            # Relative where possible, because every error message contains the path
             return candidate.relative_to(Path.cwd()) if candidate.is_relative_to(Path.cwd()) else candidate
     raise ConfigError(f"No {algo}.yml in {REPO_CONFIGS} nor beside the installed package: name a file with --conf-file.")
 
 
-def _policy_name(layers: Sequence[tuple[Place, Any]]) -> Any:
+def _policy_name(layers: Sequence[tuple[Location, Any]]) -> Any:
     given = [layer["policy"] for _, layer in layers if layer and "policy" in layer]
     return given[-1] if given else None
 
 
-def _put_over(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def _override(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merge({key: value for key, value in base.items() if not (key in _REPLACED and key in over)}, over)
 
 
 class _LayerChecker:
     """
-    Checks one source of settings after the other against one algorithm and one environment.
+    Checker of one source of settings at a time, for a given algorithm and environment.
 
-    :param algo: the algorithm
-    :param make_env: what makes the environment
-    :param n_leading: how many of its arguments the environment's id stands for
-    :param policy: the policy's name after merging, whose arguments ``policy_kwargs`` are
+    :param algo: The algorithm
+    :param make_env: Callable that makes the environment
+    :param n_leading: Number of its leading arguments that the environment's id determines
+    :param policy: Name of the policy after merging. ``policy_kwargs`` are checked against its arguments
     """
 
     def __init__(self, algo: Algo, make_env: Callable[..., Any], n_leading: int, policy: Any) -> None:
@@ -202,64 +215,68 @@ class _LayerChecker:
         self.make_env, self.n_leading = make_env, n_leading
         self.policies = self.algo_class.policy_aliases
         self.policy_class = self.policies.get(policy) if isinstance(policy, str) else None
-        arguments, _ = parameters(self.algo_class)
+        arguments, _ = accepted_arguments(self.algo_class)
         fixed = {name: f"the algorithm's name stands for {name}={value!r}" for name, value in algo.fixed.items()}
         self.reserved = {**_FLAGS, **fixed}
         self.arguments = {name: hint for name, hint in arguments.items() if name not in (*RUN_KEYS, *self.reserved)}
-        # what the algorithm hands on to its policy is set in one place only
+        # The algorithm passes some of its arguments to its policy. They can only be set as the algorithm's
         self.policy_reserved = {**_POLICY_INTERNAL, **dict.fromkeys(arguments, "set it beside policy_kwargs, not inside")}
 
-    def check(self, layer: dict[str, Any], place: Place) -> dict[str, Any]:
+    def check(self, layer: dict[str, Any], location: Location) -> dict[str, Any]:
         """
-        :param layer: settings as plain data
-        :param place: where they stand
-        :return: the settings with wrappers, callbacks, classes and schedules made
+        Check one source of settings.
+
+        :param layer: Settings as plain data
+        :param location: Where they are given
+        :return: The settings with wrappers, callbacks, classes and schedules in place of their names
+        :raises ConfigError: For a setting that does not fit
         """
         checked = {}
         allowed = [*RUN_KEYS, *self.arguments]
         for key, value in layer.items():
             if key in self.reserved:
                 why = f"{key!r} cannot be set here: {self.reserved[key]}"
-                raise ConfigError(f"{place.text}: {why}. Allowed: {', '.join(allowed)}.")
+                raise ConfigError(f"{location.text}: {why}. Allowed: {', '.join(allowed)}.")
             if key in RUN_KEYS:
-                checked[key] = self._check_run_key(key, check_value(value, RUN_KEYS[key], place.key(key)), place.key(key))
+                checked[key] = self._check_run_key(key, value, location.key(key))
             elif key in self.arguments:
-                checked[key] = check_value(value, self.arguments[key], place.key(key))
+                checked[key] = check_value(value, self.arguments[key], location.key(key))
             else:
-                raise unknown(place.text, "key", key, allowed)
+                raise unknown_setting(location.text, "key", key, allowed)
         return checked
 
-    def _check_run_key(self, key: str, value: Any, place: Place) -> Any:
+    def _check_run_key(self, key: str, value: Any, location: Location) -> Any:
+        value = check_value(value, RUN_KEYS[key], location)
         if key in ("n_envs", "n_timesteps") and value < 1:
-            raise ConfigError(f"{place.text}: must be at least 1, not {value}.")
+            raise ConfigError(f"{location.text}: must be at least 1, not {value}.")
         if key == "policy" and value not in self.policies:
-            raise unknown(place.text, "policy", value, self.policies)
+            raise unknown_setting(location.text, "policy", value, self.policies)
         if key == "policy_kwargs" and self.policy_class is not None:
-            return check_call(self.policy_class, value, place, reserved=self.policy_reserved)
+            return check_call(self.policy_class, value, location, reserved=self.policy_reserved)
         if key == "env_kwargs":
-            return check_call(self.make_env, value, place, skip=self.n_leading)
+            return check_call(self.make_env, value, location, skip=self.n_leading)
         if key == "env_wrapper":
-            return tuple(self._check_calls(value, place, skip=1))
+            return tuple(self._check_calls(value, location, skip=1))
         if key == "visibility":
-            calls = self._check_calls(value, place, skip=1)
+            calls = self._check_calls(value, location, skip=1)
             if len(calls) > 1:
-                raise ConfigError(f"{place.text}: must name one function, not {len(calls)}: there is one visibility.")
+                raise ConfigError(f"{location.text}: must name one function, not {len(calls)}: there is one visibility.")
             return partial(calls[0][0], **calls[0][1]) if calls else None
         if key == "callback":
-            callbacks = tuple(self._check_calls(value, place))
+            callbacks = tuple(self._check_calls(value, location))
             for callback, _ in callbacks:
                 if not (isinstance(callback, type) and issubclass(callback, BaseCallback)):
-                    raise ConfigError(f"{place.text}: {callback.__name__} is not a callback of Stable-Baselines3.")
+                    raise ConfigError(f"{location.text}: {callback.__name__} is not a callback of Stable-Baselines3.")
             return callbacks
         return value
 
-    def _check_calls(self, value: Any, place: Place, skip: int = 0) -> list[tuple[Callable[..., Any], dict[str, Any]]]:
-        """``path``, ``{path: arguments, ...}``, or a list of these."""
+    def _check_calls(self, value: Any, location: Location, skip: int = 0) -> list[tuple[Callable[..., Any], dict[str, Any]]]:
+        """Read what may be a ``path``, a mapping ``{path: arguments, ...}``, or a list of these."""
         calls = []
         for item in value if isinstance(value, list) else [] if value is None else [value]:
             for path, arguments in item.items() if isinstance(item, dict) else [(item, None)]:
-                function = resolve(path, place.text, place.extra_packages)
-                calls.append((function, check_call(function, arguments, place.key(path), skip=skip)))
+                function = resolve(path, location.text, location.extra_packages)
+                calls.append((function, check_call(function, arguments, location.key(path), skip=skip)))
         return calls
 
 

@@ -1,4 +1,4 @@
-"""``make demo``: a team learns to cross a junction, is measured before and after, and is shown."""
+"""The demo (``make demo``), in which a team learns to cross a junction and is measured before and after."""
 
 import os
 import shutil
@@ -22,21 +22,21 @@ from sb3_belief.zoo.evaluate import Outcome, evaluate
 from sb3_belief.zoo.run_folder import TEAM
 from sb3_belief.zoo.train import TrainOptions, make_env, make_team, train
 
-# Joint steps that two cores do in less than five minutes; the YAML entry's own number takes longer and learns more
+# Number of joint steps that takes less than five minutes on two cores. With the YAML entry's own number the team learns more
 TIMESTEPS = 60_000
 EPISODES = 512
 
 ALGO, ENV_ID = "belief_ppo", "traffic-junction-medium"
-# Episodes that neither the training nor its evaluations see, and the same traffic for everybody
+# Seed of episodes that occur neither in the training nor in its evaluations. All policies meet the same traffic
 MEASURE_SEED = 5_000_000
 MEASURE_ENVS = 64
 
 
 class ScriptedTeam:
     """
-    A reference policy as something that ``evaluate`` can play.
+    Adapter that gives a policy without training the method ``predict`` of a team.
 
-    :param policy: {agent: observations} -> {agent: actions}
+    :param policy: Callable that maps {agent: observations} to {agent: actions}
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -44,23 +44,25 @@ class ScriptedTeam:
 
     def predict(self, observation: TeamObs, state: Any = None, **_: Any) -> tuple[TeamObs, Any]:
         """
+        Return the policy's actions.
+
         :param observation: {agent: array [n_envs, width]}
-        :param state: none
-        :return: the policy's actions by agent, and the state
+        :param state: Not used
+        :return: Actions by agent, and the state as it was given
         """
         return self._policy(observation), state
 
 
 def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: list[str]) -> int:
     """
-    Train ``belief_ppo`` on ``traffic-junction-medium`` from its YAML entry, and show what it learned.
+    Train ``belief_ppo`` on ``traffic-junction-medium`` by its YAML entry, and show what it has learned.
 
-    :param n_timesteps: joint steps to train for
-    :param episodes: episodes of each measurement
-    :param seed: of the team and its environments
-    :param log_folder: folder of all runs
-    :param command: the words of the command line, to be written down
-    :return: exit status, as of ``sb3-belief train``
+    :param n_timesteps: Number of joint steps to train for
+    :param episodes: Number of episodes of each measurement
+    :param seed: Seed of the team and its environments
+    :param log_folder: Folder of all runs
+    :param command: The words of the command line, recorded in ``run.json``
+    :return: Exit status: 0, or 130 after Ctrl-C
     """
     console = Console()
     config = load_config(ALGO, ENV_ID, n_timesteps=n_timesteps)
@@ -69,7 +71,7 @@ def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: l
         seed=seed,
         log_folder=log_folder,
         eval_freq=max(n_timesteps // 8, 1),
-        # one episode per copy: the time goes into calls of the ten networks, not into their width
+        # One episode per copy. A call of the ten networks takes about as long for many rows as for few, so this saves time
         n_eval_envs=TrainOptions.eval_episodes,
         progress=True,
         verbose=0,
@@ -86,7 +88,7 @@ def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: l
         )
     )
     with console.status("Measuring random, all gas, the 3x3 rule and the untrained team"):
-        rates = {name: _measure(config, ScriptedTeam(policy), episodes) for name, policy in _bars(config).items()}
+        rates = {name: _measure(config, ScriptedTeam(policy), episodes) for name, policy in _baselines(config).items()}
         rates["before"] = _measure_untrained(config, options, seed, episodes)
     console.print(f"Before: success rate {rates['before'].success_rate:.3f}. Training (Ctrl-C ends it and saves):")
 
@@ -110,16 +112,16 @@ def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: l
     return 0
 
 
-def _bars(config: RunConfig) -> dict[str, Policy]:
+def _baselines(config: RunConfig) -> dict[str, Policy]:
     env_kwargs = {**registry.spec(ENV_ID).kwargs, **config.env_kwargs}
-    # not a seed of the copies: a random team must not draw the numbers that decide the traffic
+    # The seed differs from those of the copies, so that a random team does not draw the numbers that decide the traffic
     return {"random": RandomPolicy(MEASURE_SEED - 1), "all gas": all_gas, "3x3 rule": RulePolicy(**env_kwargs)}
 
 
-def _measure(config: RunConfig, player: Any, episodes: int) -> Outcome:
+def _measure(config: RunConfig, model: Any, episodes: int) -> Outcome:
     env = make_env(config, MEASURE_ENVS, MEASURE_SEED)
     try:
-        return evaluate(player, env, episodes)
+        return evaluate(model, env, episodes)
     finally:
         env.close()
 
@@ -127,7 +129,7 @@ def _measure(config: RunConfig, player: Any, episodes: int) -> Outcome:
 def _measure_untrained(config: RunConfig, options: TrainOptions, seed: int, episodes: int) -> Outcome:
     env = make_env(config, config.n_envs, seed)
     try:
-        # the same seed makes the very team that the training starts with
+        # With the same seed this is the team that the training starts with
         return _measure(config, make_team(config, options, env, seed), episodes)
     finally:
         env.close()
@@ -139,7 +141,7 @@ def _table(rates: Mapping[str, Outcome], seconds: float, episodes: int) -> Table
         "after": f"{ALGO} after {seconds:.0f} s",
     }
     table = Table(title=f"Episodes without a collision, of {episodes}", caption="greedy; ± standard error")
-    table.add_column("who")
+    table.add_column("policy")
     table.add_column("success rate", justify="right")
     table.add_column("")
     for name, outcome in sorted(rates.items(), key=lambda item: item[1].success_rate or 0.0):
@@ -150,7 +152,7 @@ def _table(rates: Mapping[str, Outcome], seconds: float, episodes: int) -> Table
 
 
 def _next_steps(folder: Path, curve: Path, video: Path) -> str:
-    # as it can be typed here: the environment that ran the demo need not be activated
+    # The commands must work as they are printed, even if the virtual environment that runs the demo is not activated
     bin_folder = "" if shutil.which("sb3-belief") else f"{os.path.relpath(Path(sys.executable).parent)}/"
     return "\n".join(
         [
@@ -162,7 +164,7 @@ def _next_steps(folder: Path, curve: Path, video: Path) -> str:
             "[bold]Next[/]",
             "[dim]# watch the team in a window[/]",
             f"{bin_folder}sb3-belief enjoy {folder}",
-            "[dim]# let it learn on[/]",
+            "[dim]# continue its training[/]",
             f"{bin_folder}sb3-belief train -i {folder} -P --verbose 0",
             "[dim]# the same agents without a belief[/]",
             f"{bin_folder}sb3-belief train --algo ippo --env {ENV_ID} -P --verbose 0",

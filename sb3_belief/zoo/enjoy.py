@@ -1,4 +1,4 @@
-"""Watch a trained team: in a window, or as a GIF or MP4."""
+"""Replay of a trained team, in a window or as a GIF or MP4 file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
-from sb3_belief.zoo.checks import parameters
+from sb3_belief.zoo.checks import accepted_arguments
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import Outcome
@@ -22,16 +22,18 @@ VIDEO_FORMATS = (".gif", ".mp4")
 @dataclass(frozen=True)
 class EnjoyOptions:
     """
-    :param run: a run's folder, or a team's zip in it
-    :param episodes: stop after that many episodes
-    :param n_timesteps: or after that many steps, if given
-    :param deterministic: whether the agents do what they think best, or sample
-    :param seed: of the environment
-    :param output: ``.gif`` or ``.mp4`` file; None for a window
-    :param fps: frames per second of the file, None for the environment's own
-    :param env_kwargs: ``key:value`` pairs that win over those of the run
-    :param extra_packages: see ``names.resolve``
-    :param device: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
+    Options of a replay.
+
+    :param run: Folder of a run, or zip of a team in it
+    :param episodes: Number of episodes to play
+    :param n_timesteps: Number of steps to play instead, or None
+    :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
+    :param seed: Seed of the environment
+    :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
+    :param fps: Frames per second of the file, or None for the environment's own rate
+    :param env_kwargs: ``key:value`` pairs of arguments of the environment, which override those of the run
+    :param extra_packages: See ``names.resolve``
+    :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     """
 
     run: str
@@ -48,20 +50,20 @@ class EnjoyOptions:
 
 def enjoy(options: EnjoyOptions) -> Outcome:
     """
-    Replay a trained team and print what it earns.
+    Replay a trained team and print its returns and successes.
 
-    :param options: what to show
-    :return: returns and successes of the finished episodes
-    :raises ConfigError: if there is no such team, or it cannot be shown as asked
+    :param options: Options of the replay
+    :return: Returns and successes of the finished episodes
+    :raises ConfigError: If there is no such team, or it cannot be shown in the way that the options ask for
     """
     if options.output is not None and Path(options.output).suffix.lower() not in VIDEO_FORMATS:
         raise ConfigError(f"--output: {options.output!r} must end in {' or '.join(VIDEO_FORMATS)}.")
     path = find_team(options.run, "enjoy")
     config, frame_rate = _config_of(path, options)
-    env = _make_env(config, options)
+    env = _make_team_env(config, options)
     try:
         team = Team.load(path, env=env, device=options.device)
-        # After loading, which seeds the environment as it was seeded for the training
+        # This comes after loading, which seeds the environment as in the training
         env.seed(options.seed)
         frames: list[np.ndarray] | None = None if options.output is None else []
         outcome = _play(team, env, options, frames)
@@ -76,16 +78,19 @@ def enjoy(options: EnjoyOptions) -> Outcome:
 
 def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
     """
-    :param path: ``.gif`` or ``.mp4`` file; its folder is made if need be
-    :param frames: pictures, uint8 [height, width, 3]
-    :param fps: frames per second
-    :raises ConfigError: if imageio is not installed
+    Write frames to a video file.
+
+    :param path: ``.gif`` or ``.mp4`` file. Its folder is created if necessary
+    :param frames: Images, uint8 ``[height, width, 3]``
+    :param fps: Frames per second
+    :raises ConfigError: If imageio is not installed
     """
     try:
         import imageio.v2 as imageio
     except ImportError as error:
         raise ConfigError(f"Writing {path.name} needs imageio: pip install 'sb3-belief[plots]'.") from error
     path.parent.mkdir(parents=True, exist_ok=True)
+    # imageio takes the duration of a frame in milliseconds for a GIF, and a frame rate for an MP4
     if path.suffix.lower() == ".gif":
         imageio.mimsave(path, frames, duration=1000 / fps, loop=0)  # type: ignore[arg-type]
     else:
@@ -94,41 +99,44 @@ def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
 
 def _config_of(team: Path, options: EnjoyOptions) -> tuple[RunConfig, int]:
     """
-    :return: the run's configuration, with a render mode if there are pictures, and how many of them make a second
+    Return the configuration for the replay and the environment's frame rate.
+
+    :return: Configuration of the run, with a render mode if the environment has images, and frames per second
     """
     run = run_of(team)
     if run is None:
         raise ConfigError(
-            f"enjoy: {str(team)!r} lies in no run's folder (no config.yml and run.json), so its environment is not known."
+            f"enjoy: {str(team)!r} is not in the folder of a run (no config.yml and run.json), so its environment is unknown."
         )
     algo, env_id, conf_file = run
     config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=options.extra_packages)
     render_mode = "human" if options.output is None else "rgb_array"
-    env = _make_one(config)
-    arguments, open_ended = parameters(spec(config.env_id).load())
-    has_pictures = render_mode in env.metadata.get("render_modes", []) and (open_ended or "render_mode" in arguments)
-    # SB3's vectorised environments do not pass this on
+    # SB3's vectorised environments do not pass on the metadata, so it is read from a single copy
+    env = _make_single_env(config)
+    arguments, open_ended = accepted_arguments(spec(config.env_id).load())
+    # An environment may render and still be made by a callable that does not take a render mode
+    has_images = render_mode in env.metadata.get("render_modes", []) and (open_ended or "render_mode" in arguments)
     frame_rate = int(env.metadata.get("render_fps", 10))
     env.close()
-    if has_pictures:
+    if has_images:
         return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode}), frame_rate
     if options.output is not None:
-        raise ConfigError(f"enjoy: {config.env_id} has no pictures to write to {options.output!r}; leave out --output.")
+        raise ConfigError(f"enjoy: {config.env_id} has no images to write to {options.output!r}; leave out --output.")
     return config, frame_rate
 
 
-def _make_one(config: RunConfig) -> Any:
-    with _refusals(config):
+def _make_single_env(config: RunConfig) -> Any:
+    with _refusals_as_config_errors(config):
         return make_parallel_env(config.env_id, **config.env_kwargs)
 
 
-def _make_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:
-    with _refusals(config):
+def _make_team_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:
+    with _refusals_as_config_errors(config):
         return make_team_env(config.env_id, seed=options.seed, env_kwargs=config.env_kwargs, wrapper=config.wrapper)
 
 
 @contextmanager
-def _refusals(config: RunConfig) -> Iterator[None]:
+def _refusals_as_config_errors(config: RunConfig) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, ImportError) as error:
@@ -161,8 +169,8 @@ def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.nd
     except RuntimeError as error:
         if options.output is not None:
             raise
-        # pygame without a screen
-        raise ConfigError(f"enjoy: cannot open a window ({error}). To a file instead: --output episode.gif") from error
+        # pygame raises a RuntimeError where there is no screen
+        raise ConfigError(f"enjoy: cannot open a window ({error}). Write a file instead: --output episode.gif") from error
     return Outcome(np.array(returns, dtype=float), np.array(successes, dtype=bool))
 
 

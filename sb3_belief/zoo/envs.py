@@ -1,36 +1,40 @@
-"""``sb3-belief envs``: which environments there are, and whether one keeps the contract."""
+"""The command ``sb3-belief envs``, which lists the environments and checks whether one fits a team."""
 
 from sb3_belief.envs.registry import registered_ids
 from sb3_belief.envs.suites import SUITES
-from sb3_belief.zoo.errors import ConfigError, unknown
+from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.names import load_env
 from sb3_belief.zoo.yaml_data import parse_pairs
 
-# A family with more names than this is listed in full only if it is asked for
+# In the list of all suites, only this many names of each are shown
 _SHORT = 12
 
 
-def list_envs(family: str | None = None) -> str:
+def list_envs(suite: str | None = None) -> str:
     """
-    :param family: only the ids of this one, all of them
-    :return: what there is, what is installed, and what installs the rest
-    :raises ConfigError: for an unknown family
+    Return the list of environments that ``sb3-belief envs`` prints.
+
+    :param suite: Suite whose ids are all listed. None for the registered ids and the first ids of each suite
+    :return: Ids of what is installed, and command lines that install the rest
+    :raises ConfigError: For an unknown suite
     """
-    if family is None:
+    if suite is None:
         parts = [_block("Registered", registered_ids())]
-        parts += [_family(name) for name in SUITES]
-        parts.append("<module>:<callable>\n  anything that returns a PettingZoo ParallelEnv (its package: --allow-package)")
+        parts += [_suite_block(name) for name in SUITES]
+        parts.append(
+            "<module>:<callable>\n  any callable that returns a PettingZoo ParallelEnv (its package: --allow-package)"
+        )
         return "\n\n".join(parts)
-    if family not in SUITES:
-        raise unknown("envs list", "family", family, SUITES)
-    return _family(family, full=True)
+    if suite not in SUITES:
+        raise unknown_setting("envs list", "suite", suite, SUITES)
+    return _suite_block(suite, full=True)
 
 
-def _family(name: str, full: bool = False) -> str:
-    family = SUITES[name]
-    if family.missing():
-        return _block(f"{name}/<name>: not installed", [family.install, *([family.note] if family.note else [])])
-    names = family.known_names()
+def _suite_block(name: str, full: bool = False) -> str:
+    suite = SUITES[name]
+    if suite.missing():
+        return _block(f"{name}/<name>: not installed", [suite.install, *([suite.note] if suite.note else [])])
+    names = suite.known_names()
     lines = [f"{name}/{each}" for each in (names if full else names[:_SHORT])]
     if len(names) > len(lines):
         lines.append(f"... and {len(names) - len(lines)} more: sb3-belief envs list {name}")
@@ -41,20 +45,21 @@ def _block(title: str, lines: list[str]) -> str:
     return "\n  ".join([title, *lines])
 
 
-def check_env(
+def print_env_check(
     env_id: str, env_kwargs: list[str], n_steps: int = 500, seed: int = 0, extra_packages: tuple[str, ...] = ()
 ) -> bool:
     """
-    Play an environment, and print what of a team's contract it keeps.
+    Play an environment at random and print which requirements of a team it meets.
 
-    :param env_id: a registered id, ``family/name`` or ``module:callable``
-    :param env_kwargs: ``key:value`` pairs for the environment
-    :param n_steps: how long to play
-    :param seed: of the environment
-    :param extra_packages: see ``names.resolve``
-    :return: whether nothing has to be changed
-    :raises ConfigError: if there is no such environment
+    :param env_id: Registered id, ``suite/name`` or ``module:callable``
+    :param env_kwargs: ``key:value`` pairs of arguments of the environment
+    :param n_steps: Number of steps to play
+    :param seed: Seed of the environment
+    :param extra_packages: See ``names.resolve``
+    :return: Whether the environment meets all requirements
+    :raises ConfigError: If there is no such environment
     """
+    # Imported here, because listing environments does not need it
     from sb3_belief.envs.env_checker import check_team_env
 
     load_env(env_id, "envs check", extra_packages)

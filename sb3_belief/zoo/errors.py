@@ -1,30 +1,38 @@
-"""What a user sees when a setting is refused."""
+"""The error for settings that do not fit."""
 
 from collections.abc import Iterable
 
-from sb3_belief.envs import suites
+from sb3_belief.envs.suites import nearest
 
 
 class ConfigError(ValueError):
-    """A setting refused before anything started. The message names its place, what is allowed and the nearest match."""
-
-
-def nearest(given: object, allowed: Iterable[str]) -> str:
     """
-    :param given: what was typed
-    :param allowed: what could have been typed
-    :return: `` Did you mean 'x'?`` (with the leading space), or nothing if no name is near
+    Error for a setting that is refused before anything has started.
+
+    The message names the file and section or the flag, what is allowed, and the nearest match.
     """
-    return suites.nearest(given, allowed, most=2, cutoff=0.5)
 
 
-def unknown(where: str, kind: str, given: object, allowed: Iterable[str]) -> ConfigError:
+def suggestion(given: object, allowed: Iterable[str]) -> str:
     """
-    :param where: file and section, or flag
-    :param kind: what was to be named, e.g. ``"key"``
-    :param given: the name that does not exist
-    :param allowed: the names that do
-    :return: the error to raise
+    Return a suggestion for a misspelt setting, to be appended to an error message.
+
+    :param given: What the user typed
+    :param allowed: The names that are allowed
+    :return: `` Did you mean 'x'?`` with the leading space, or an empty string if no name is similar enough
+    """
+    return nearest(given, allowed, most=2, cutoff=0.5)
+
+
+def unknown_setting(where: str, kind: str, given: object, allowed: Iterable[str]) -> ConfigError:
+    """
+    Return the error for a name that does not exist.
+
+    :param where: File and section, or flag
+    :param kind: What the name should be a name of, e.g. ``"key"``
+    :param given: The name that does not exist
+    :param allowed: The names that exist
+    :return: The error to raise
     """
     names = list(allowed)
-    return ConfigError(f"{where}: unknown {kind} {given!r}.{nearest(given, names)} Allowed: {', '.join(names) or 'none'}.")
+    return ConfigError(f"{where}: unknown {kind} {given!r}.{suggestion(given, names)} Allowed: {', '.join(names) or 'none'}.")

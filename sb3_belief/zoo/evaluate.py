@@ -1,4 +1,4 @@
-"""Play episodes and count."""
+"""Returns and success rates of a team, measured by playing episodes."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +13,10 @@ from sb3_belief.team import TeamVecEnv
 @dataclass(frozen=True)
 class Outcome:
     """
-    :param returns: team return of each episode
-    :param successes: whether each episode succeeded; empty if the environment does not say
+    Results of episodes that were played.
+
+    :param returns: The team's return of each episode, float ``[k]``
+    :param successes: Whether each episode succeeded, bool ``[k]``. Empty if the environment does not report successes
     """
 
     returns: np.ndarray
@@ -22,34 +24,41 @@ class Outcome:
 
     @property
     def success_rate(self) -> float | None:
-        """Share of the episodes that succeeded, or None if the environment does not say."""
+        """Fraction of the episodes that succeeded, or None if the environment does not report successes."""
         return float(self.successes.mean()) if self.successes.size else None
 
     @property
     def standard_error(self) -> float | None:
-        """Standard error of the success rate."""
+        """Standard error of the success rate, or None if there is none."""
         rate = self.success_rate
         return None if rate is None else float(np.sqrt(rate * (1 - rate) / self.successes.size))
 
 
-def evaluate(player: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool = True) -> Outcome:
+def evaluate(model: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool = True) -> Outcome:
     """
-    :param player: a ``Team``, or anything with its ``predict``
-    :param env: where to play; evaluated from a reset on
-    :param n_episodes: number of episodes, shared out evenly among the copies so that short ones are not preferred
-    :param deterministic: whether the player does what it thinks best, or samples
-    :return: what came out
+    Play episodes from a reset on and return their results.
+
+    :param model: A ``Team``, or any object with a ``predict`` like its own
+    :param env: Environment to play in
+    :param n_episodes: Number of episodes. Each copy plays the same share of them, so that short episodes are not preferred
+    :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
+    :return: The results
     """
     successes: list[bool] = []
 
-    def note(locals_: dict[str, Any], _: dict[str, Any]) -> None:
-        # called at each step of the episodes that count
+    def record_success(locals_: dict[str, Any], _: dict[str, Any]) -> None:
+        # SB3's evaluation returns no successes. It calls this at each step of the episodes that count
         if locals_["done"] and "is_success" in locals_["info"]:
             successes.append(bool(locals_["info"]["is_success"]))
 
-    # The environment's masks hold wherever a model takes them
-    run = evaluate_masked if getattr(player, "takes_masks", False) else evaluate_policy
+    # Only sb3-contrib's evaluation passes the environment's action masks on
+    run = evaluate_masked if getattr(model, "takes_masks", False) else evaluate_policy
     returns, _ = run(
-        player, env, n_eval_episodes=n_episodes, deterministic=deterministic, callback=note, return_episode_rewards=True
+        model,
+        env,
+        n_eval_episodes=n_episodes,
+        deterministic=deterministic,
+        callback=record_success,
+        return_episode_rewards=True,
     )
     return Outcome(np.asarray(returns, dtype=float), np.asarray(successes, dtype=bool))

@@ -1,4 +1,8 @@
-"""What a configuration may name: algorithms by a short name, classes and wrappers by a dotted path from known packages."""
+"""
+The names that a configuration may use.
+
+Algorithms have short names. Classes, wrappers, functions and callbacks are named by dotted paths into known packages.
+"""
 
 import importlib
 import inspect
@@ -11,9 +15,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
 from sb3_belief.envs.suites import SUITES
-from sb3_belief.zoo.errors import ConfigError, nearest, unknown
+from sb3_belief.zoo.errors import ConfigError, suggestion, unknown_setting
 
-#: Packages (or parts of them) that a dotted path in a YAML file may point into
+#: The packages, or parts of packages, into which a dotted path in a YAML file may point
 ALLOWED_PACKAGES = (
     "sb3_belief",
     "stable_baselines3",
@@ -28,19 +32,26 @@ ALLOWED_PACKAGES = (
 @dataclass(frozen=True)
 class Algo:
     """
-    :param path: ``"module:class"``, imported when the algorithm is asked for
-    :param fixed: constructor arguments that the name stands for; a configuration cannot change them
+    Algorithm that a short name stands for.
+
+    :param path: ``"module:class"``, which is imported when the algorithm is used
+    :param fixed: Constructor arguments that the name implies. A configuration cannot change them
     """
 
     path: str
     fixed: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     def load(self) -> type[BaseAlgorithm]:
+        """
+        Import the algorithm.
+
+        :return: Its class
+        """
         module, _, name = self.path.partition(":")
         return getattr(importlib.import_module(module), name)
 
 
-#: The algorithms whose unmodified ``learn()`` runs inside a team (not ARS, which drives its environments by itself)
+#: The algorithms whose unmodified ``learn()`` runs in a team. ARS is not among them, because it steps its environments itself
 ALGOS: Mapping[str, Algo] = MappingProxyType(
     {
         "belief_ppo": Algo("sb3_belief.belief_ppo:BeliefPPO"),
@@ -64,12 +75,14 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
 
 def get_algo(name: str) -> Algo:
     """
-    :param name: a key of ``ALGOS``
-    :return: the algorithm
-    :raises ConfigError: for another name
+    Return the algorithm that a short name stands for.
+
+    :param name: A key of ``ALGOS``
+    :return: The algorithm
+    :raises ConfigError: For another name
     """
     if name not in ALGOS:
-        raise unknown("--algo", "algorithm", name, ALGOS)
+        raise unknown_setting("--algo", "algorithm", name, ALGOS)
     return ALGOS[name]
 
 
@@ -79,16 +92,17 @@ def _is_allowed(module: str, packages: tuple[str, ...]) -> bool:
 
 def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
     """
-    Find the class or function that a dotted path names, without evaluating anything.
+    Return the class or function that a dotted path names.
 
-    Both the module that the path names and the one that the object was defined in must be of an allowed package: otherwise
-    ``some.allowed.module.os.system`` would be a way out, through what a module happens to import.
+    The path is looked up and never evaluated. Both the module in the path and the module in which the object was defined must
+    belong to an allowed package. Without the second condition a path could reach whatever an allowed module imports, as in
+    ``some.allowed.module.os.system``.
 
-    :param path: e.g. ``"supersuit.frame_stack_v1"``
-    :param where: file, section and key, for the error message
-    :param extra_packages: packages allowed by whoever typed the command (``--allow-package``)
-    :return: the class or function
-    :raises ConfigError: if the path is none, is not allowed, or names nothing
+    :param path: Dotted path, e.g. ``"supersuit.frame_stack_v1"``
+    :param where: File, section and key, or flag, for the error message
+    :param extra_packages: Further packages that the user allows on the command line (``--allow-package``)
+    :return: The class or function
+    :raises ConfigError: If this is not a dotted path, is not allowed, or names nothing
     """
     packages = (*ALLOWED_PACKAGES, *extra_packages)
     module_name, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
@@ -97,17 +111,17 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     allowed = f"Allowed: what {', '.join(packages)} define (more packages: the flag --allow-package NAME)."
     if not _is_allowed(module_name, packages):
         root = path.split(".")[0]
-        raise ConfigError(f"{where}: {path!r} is not of an allowed package.{nearest(root, packages)} {allowed}")
+        raise ConfigError(f"{where}: {path!r} is not of an allowed package.{suggestion(root, packages)} {allowed}")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigError(f"{where}: no module {module_name!r} for {path!r} ({error}). {allowed}") from None
     try:
-        # supersuit raises ImportError for a wrapper's old version, and says the new one
+        # supersuit raises ImportError for an old version of a wrapper. Its message names the new one
         found = getattr(module, name)
     except (AttributeError, ImportError) as error:
         public = [attr for attr in dir(module) if not attr.startswith("_")]
-        raise ConfigError(f"{where}: {module_name!r} has no {name!r} ({error}).{nearest(name, public)} {allowed}") from None
+        raise ConfigError(f"{where}: {module_name!r} has no {name!r} ({error}).{suggestion(name, public)} {allowed}") from None
     is_code = inspect.isclass(found) or inspect.isfunction(found)
     if not is_code or not _is_allowed(found.__module__, packages):
         raise ConfigError(f"{where}: {path!r} is not a class or function that its package defines itself. {allowed}")
@@ -116,29 +130,35 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
 
 def get_env(env_id: str, where: str) -> EnvSpec:
     """
-    :param env_id: a registered id, ``family/name`` or ``module:callable``
-    :param where: file and section, or flag, for the error message
-    :return: its specification; nothing is imported for it
-    :raises ConfigError: for another id
+    Return the specification of an environment, without importing its package.
+
+    :param env_id: Registered id, ``suite/name`` or ``module:callable``
+    :param where: File and section, or flag, for the error message
+    :return: The specification
+    :raises ConfigError: For an unknown id
     """
     try:
         return spec(env_id)
     except ValueError as error:
+        # The registry's own message is better here: it compares with the suites, or lists the names of the one meant
         if "/" in env_id or env_id in SUITES:
             raise ConfigError(f"{where}: {error}") from None
-        kinds = [*registered_ids(), *(f"{family}/<name>" for family in SUITES), "<module>:<callable>"]
-        raise unknown(where, "environment", env_id, kinds) from None
+        kinds = [*registered_ids(), *(f"{suite}/<name>" for suite in SUITES), "<module>:<callable>"]
+        raise unknown_setting(where, "environment", env_id, kinds) from None
 
 
 def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
     """
-    :param env_id: see ``get_env``
-    :param where: flag, for the error message
-    :param extra_packages: see ``resolve``; a ``module:callable`` must be of an allowed package
-    :return: what makes one copy of the environment
-    :raises ConfigError: for an id that is none or is not allowed, or whose package is not installed
+    Import and return the callable that makes one copy of an environment.
+
+    :param env_id: See ``get_env``
+    :param where: Flag or command, for the error message
+    :param extra_packages: See ``resolve``. A ``module:callable`` must belong to an allowed package
+    :return: The callable
+    :raises ConfigError: For an id that is unknown or not allowed, or whose package is not installed
     """
     found = get_env(env_id, where)
+    # The specification of a "module:callable" holds the id itself. This kind can name any code, so the allow-list applies
     if found.parallel == env_id:
         return resolve(env_id.replace(":", "."), where, extra_packages)
     try:

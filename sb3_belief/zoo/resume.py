@@ -1,13 +1,13 @@
-"""Which settings a run has that goes on from a saved team (``-i``)."""
+"""Settings of a run that continues training a saved team (``-i``)."""
 
 from collections.abc import Sequence
 
 from sb3_belief.zoo.config import RUN_KEYS, RunConfig, load_config
-from sb3_belief.zoo.errors import ConfigError, nearest
+from sb3_belief.zoo.errors import ConfigError, suggestion
 from sb3_belief.zoo.run_folder import find_team, run_of
 from sb3_belief.zoo.yaml_data import parse_pairs
 
-# What the saved models bring themselves
+# Settings of the models, which are saved in the team
 _SAVED = ("policy", "policy_kwargs", "normalize")
 
 
@@ -22,27 +22,29 @@ def resume_config(
     extra_packages: tuple[str, ...] = (),
 ) -> RunConfig:
     """
-    The settings of the run that saved the team, so that it goes on as it was; a team that lies in no run's folder takes those
-    of the configuration file. Settings of the run (number of copies, environment, ...) may change, those of the models not:
-    they are saved in them.
+    Return the configuration of a run that continues training a saved team.
 
-    :param trained: a run's folder or a team's zip
-    :param algo: see ``load_config``; None: that of the saved team, which it must be
-    :param env_id: see ``load_config``; None: that of the saved team's run, else one with the same agents
-        and spaces
-    :param conf_file: see ``load_config``
-    :param params: see ``load_config``
-    :param env_kwargs: see ``load_config``
-    :param n_timesteps: further joint steps
-    :param extra_packages: see ``load_config``
-    :return: the configuration
-    :raises ConfigError: for settings that do not fit the saved team, or what ``load_config`` refuses
+    Unless given anew, the settings are those of the run that saved the team. For a team outside the folder of a run they come
+    from the configuration file. Settings of the run (number of copies, environment, ...) may change, but those of the models
+    may not, because they are saved in the models.
+
+    :param trained: Folder of a run, or zip of a team
+    :param algo: See ``load_config``. It must be the algorithm of the saved team, which is also the default
+    :param env_id: See ``load_config``. The environment must have the same agents and spaces as the saved team's, which is the
+        default
+    :param conf_file: See ``load_config``
+    :param params: See ``load_config``
+    :param env_kwargs: See ``load_config``
+    :param n_timesteps: Number of further joint steps
+    :param extra_packages: See ``load_config``
+    :return: The configuration
+    :raises ConfigError: For settings that do not fit the saved team, or that ``load_config`` refuses
     """
     changeable = [key for key in RUN_KEYS if key not in _SAVED]
     for key in parse_pairs(params, "-params"):
         if key not in changeable:
             raise ConfigError(
-                f"-params: {key!r} cannot be set with -i, the saved models bring their settings.{nearest(key, changeable)}"
+                f"-params: {key!r} cannot be set with -i, the saved models keep their settings.{suggestion(key, changeable)}"
                 f" Allowed: {', '.join(changeable)}."
             )
     run = run_of(find_team(trained, "--trained-agent"))
@@ -51,8 +53,9 @@ def resume_config(
         algo, env_id = algo or saved_algo, env_id or saved_env
         if algo != saved_algo:
             raise ConfigError(f"--algo: {algo!r} does not fit the saved team, which is of {saved_algo!r}.")
+        # The run's own file has a section for its own environment only
         if conf_file is None and env_id == saved_env:
             conf_file = str(saved_conf)
     if algo is None or env_id is None:
-        raise ConfigError(f"--trained-agent: {trained!r} lies in no run's folder: say --algo and --env.")
+        raise ConfigError(f"--trained-agent: {trained!r} is not in the folder of a run: give --algo and --env.")
     return load_config(algo, env_id, conf_file, params, env_kwargs, n_timesteps, extra_packages)

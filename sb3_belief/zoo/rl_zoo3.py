@@ -1,4 +1,4 @@
-"""This package's algorithms in RL Baselines3 Zoo (``rl_zoo3``), whose own ``train`` then runs them with our YAML files."""
+"""Registration of this package's algorithms in RL Baselines3 Zoo (``rl_zoo3``), which then trains them by our YAML files."""
 
 import importlib
 from collections.abc import Callable, Mapping
@@ -10,17 +10,17 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.zoo.checks import Place, check_value, parameters
+from sb3_belief.zoo.checks import Location, accepted_arguments, check_value
 from sb3_belief.zoo.config import DEFAULT, find_config_file
 from sb3_belief.zoo.yaml_data import merge, read_file
 
-# rl_zoo3 reads these by itself, schedules included
+# rl_zoo3 reads these settings itself, schedules included
 _READ_BY_ZOO = ("policy", "policy_kwargs", "learning_rate", "clip_range", "clip_range_vf")
 _SIZES = ("embedding_dim", "latent_dim")
 
 
 class IndependentPPO(BeliefPPO):
-    """``BeliefPPO`` with ``belief="none"``: ``ippo`` as a class, since rl_zoo3 knows algorithms by their classes."""
+    """``BeliefPPO`` with ``belief="none"``. rl_zoo3 needs one class for each of its algorithms."""
 
     def __init__(self, policy: Any, env: Any, **kwargs: Any) -> None:
         super().__init__(policy, env, belief="none", **kwargs)
@@ -35,8 +35,10 @@ ALGOS: Mapping[str, type[BaseAlgorithm]] = {
 
 def register_rl_zoo3() -> None:
     """
-    Make ``belief_ppo``, ``ippo`` and ``maskable_belief_ppo`` known to rl_zoo3: to ``train`` and ``enjoy``, and to the search
-    for hyper-parameters with a sampler and a converter each. To be called before ``rl_zoo3.train.train()``::
+    Register ``belief_ppo``, ``ippo`` and ``maskable_belief_ppo`` in rl_zoo3.
+
+    They are then available to its ``train``, its ``enjoy`` and, with a sampler and a converter each, to its search for
+    hyper-parameters. Call this before ``rl_zoo3.train.train()``::
 
         import gymnasium as gym
         from rl_zoo3.train import train
@@ -46,12 +48,12 @@ def register_rl_zoo3() -> None:
         register_rl_zoo3()
         train()
 
-    For these algorithms ``--conf-file`` (default: ``zoo_configs/<algo>.yml``) is read as by ``sb3-belief``: the section
-    ``default`` lies under every other one, ``3e-4`` is a number, dotted paths and ``lin_x`` are possible wherever the
-    algorithm takes a class or a schedule. All else is rl_zoo3's: its ``env_wrapper`` wraps the learner's environment.
-    rl_zoo3 evaluates without action masks: give ``--eval-freq -1`` where an environment refuses actions.
+    For these algorithms ``--conf-file`` (default: ``zoo_configs/<algo>.yml``) is read as by ``sb3-belief``: the settings of
+    the section ``default`` hold for all environments, ``3e-4`` is a number, and dotted paths and ``lin_x`` are possible
+    wherever the algorithm takes a class or a schedule. Everything else is as rl_zoo3 does it. Its ``env_wrapper`` wraps the
+    learner's environment. It evaluates without action masks, so use ``--eval-freq -1`` if the environment refuses actions.
 
-    :raises ModuleNotFoundError: if rl_zoo3 is not installed, with the line that installs it
+    :raises ModuleNotFoundError: If rl_zoo3 is not installed. The message has the line that installs it
     """
     try:
         train, utils, exp_manager, search = (
@@ -68,15 +70,18 @@ def register_rl_zoo3() -> None:
     for algo in ALGOS:
         searched = (search.sample_ppo_params, search.convert_onpolicy_params) if algo == "ippo" else (sample, convert)
         search.HYPERPARAMS_SAMPLER[algo], search.HYPERPARAMS_CONVERTER[algo] = searched
-    # Seen by mypy as plain modules
+    # rl_zoo3.train has imported the class by name, so it is replaced there. mypy knows no attributes of such a module, hence
+    # vars()
     vars(train)["ExperimentManager"] = _reading_our_files(exp_manager.ExperimentManager)
 
 
 def _with_belief(sample_ppo: Callable[..., Any], convert_ppo: Callable[..., Any]) -> tuple[Callable, Callable]:
     """
-    :param sample_ppo: rl_zoo3's sampler of PPO's hyper-parameters
-    :param convert_ppo: rl_zoo3's converter of what was sampled
-    :return: sampler and converter for an algorithm with a belief
+    Return the sampler and the converter of hyper-parameters for an algorithm with a belief.
+
+    :param sample_ppo: rl_zoo3's sampler for PPO
+    :param convert_ppo: rl_zoo3's converter for PPO, which turns sampled parameters into arguments of the algorithm
+    :return: Sampler and converter
     """
 
     def convert(sampled: dict[str, Any]) -> dict[str, Any]:
@@ -100,12 +105,16 @@ def _with_belief(sample_ppo: Callable[..., Any], convert_ppo: Callable[..., Any]
 
 def _reading_our_files(manager_class: Any) -> Any:
     """
+    Return a subclass of rl_zoo3's ``ExperimentManager`` that reads our YAML files for our algorithms.
+
+    It is made by a function because rl_zoo3 is an optional package.
+
     :param manager_class: rl_zoo3's ``ExperimentManager``
-    :return: a subclass of it that reads our YAML files for our algorithms
+    :return: The subclass
     """
 
     class ExperimentManager(manager_class):
-        """rl_zoo3's, which reads our YAML files for our algorithms."""
+        """``ExperimentManager`` of rl_zoo3 that reads our YAML files for our algorithms."""
 
         config: str
 
@@ -123,7 +132,7 @@ def _reading_our_files(manager_class: Any) -> Any:
             default = sections.get(DEFAULT, {})
             with TemporaryDirectory() as folder:
                 path = Path(folder) / Path(given).name
-                # What rl_zoo3's reader would take for texts is written out as numbers
+                # rl_zoo3 reads the file by PyYAML, for which 3e-4 is a string. Here it is a number, and is written as 0.0003
                 path.write_text(yaml.safe_dump({name: merge(default, section) for name, section in sections.items()}))
                 self.config = str(path)
                 try:
@@ -133,26 +142,28 @@ def _reading_our_files(manager_class: Any) -> Any:
 
         def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
             if self.algo in ALGOS:
-                hyperparams = self._read_texts(hyperparams)
+                hyperparams = self._read_strings(hyperparams)
             return super()._preprocess_hyperparams(hyperparams)
 
-        def _read_texts(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
+        def _read_strings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
             """
-            :return: with schedules and classes in place of their names; what is an object already stays as it is
+            Return the hyper-parameters with schedules and classes in place of the strings that describe them.
+
+            Values that are not strings stay as they are, because rl_zoo3's command line may have made objects of them.
             """
-            algo_class, place = ALGOS[self.algo], Place(self.config)
-            arguments, _ = parameters(algo_class)
+            algo_class, location = ALGOS[self.algo], Location(self.config)
+            arguments, _ = accepted_arguments(algo_class)
             read = {
-                key: check_value(value, arguments[key], place.key(key))
+                key: check_value(value, arguments[key], location.key(key))
                 if isinstance(value, str) and key in arguments and key not in _READ_BY_ZOO
                 else value
                 for key, value in hyperparams.items()
             }
             policy_class = algo_class.policy_aliases.get(read.get("policy", ""))
             if isinstance(read.get("policy_kwargs"), dict) and policy_class is not None:
-                arguments, _ = parameters(policy_class)
+                arguments, _ = accepted_arguments(policy_class)
                 read["policy_kwargs"] = {
-                    key: check_value(value, arguments.get(key, Any), place.key("policy_kwargs").key(key))
+                    key: check_value(value, arguments.get(key, Any), location.key("policy_kwargs").key(key))
                     if isinstance(value, str)
                     else value
                     for key, value in read["policy_kwargs"].items()

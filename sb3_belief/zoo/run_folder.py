@@ -1,4 +1,4 @@
-"""The folder of a run: its number, and the record of what ran in it."""
+"""Folders of runs: their names, their records ``run.json``, and the saved teams in them."""
 
 import json
 import os
@@ -24,14 +24,14 @@ CHECKPOINTS = "checkpoints"
 
 def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) -> Path:
     """
-    Make ``<log_folder>/<algo>/<env>_<k>/`` with k one above the highest there is, and the environment's id as ``folder_name``
-    writes it. Runs that start at the same moment get different folders: making one fails if another was faster, and then the
-    next number is tried.
+    Create the folder ``<log_folder>/<algo>/<env>_<k>/`` of a new run.
 
-    :param log_folder: folder of all runs
-    :param algo: name of the algorithm
-    :param env_id: id of the environment
-    :return: the new, empty folder
+    ``<env>`` is what ``folder_name`` makes of the environment's id, and k is one above the highest number that exists.
+
+    :param log_folder: Folder of all runs
+    :param algo: Name of the algorithm
+    :param env_id: Id of the environment
+    :return: The new, empty folder
     """
     parent, name = Path(log_folder) / algo, folder_name(env_id)
     numbers = [path.name.removeprefix(f"{name}_") for path in parent.glob(f"{name}_*")]
@@ -40,6 +40,7 @@ def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) 
         number += 1
         folder = parent / f"{name}_{number}"
         try:
+            # Of several runs that start at the same moment only one creates this folder. The others try the next number
             folder.mkdir(parents=True)
         except FileExistsError:
             continue
@@ -48,34 +49,38 @@ def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) 
 
 def folder_name(env_id: str) -> str:
     """
-    :param env_id: id of an environment, e.g. ``"mpe/simple_spread_v3"`` or ``"my_games:make"``
-    :return: one folder's name: ``"mpe-simple_spread_v3"``, ``"my_games-make"``
+    Return an environment's id with all characters replaced that do not belong in the name of a folder.
+
+    :param env_id: Id of an environment, e.g. ``"mpe/simple_spread_v3"`` or ``"my_games:make"``
+    :return: Name of a single folder, e.g. ``"mpe-simple_spread_v3"`` or ``"my_games-make"``
     """
     return re.sub(r"[^\w.-]", "-", env_id)
 
 
 def remove_run_folder(folder: Path) -> None:
     """
-    Take back ``make_run_folder`` for a run that was refused before it wrote anything; folders above that are empty go too.
+    Remove the folder of a run that was refused before it wrote anything, and the two folders above it if they are empty.
 
-    :param folder: the run's folder
+    :param folder: Folder that ``make_run_folder`` created
     """
     try:
         for path in (folder, folder.parent, folder.parent.parent):
             path.rmdir()
     except OSError:
-        # not empty: there are other runs
+        # The folder is not empty, so it belongs to other runs
         pass
 
 
 class RunRecord:
     """
-    ``run.json``: what ran, with which seed, by which command, and how it ended. Written at the start and at the end, so that a
-    run that was killed still says ``running``.
+    The file ``run.json``, which records what ran, with which seed, by which command, and how it ended.
 
-    :param folder: the run's folder
-    :param command: the words of the command line
-    :param content: whatever else belongs there
+    It is written at the start and at the end of the run. In the record of a run that was killed the status remains
+    ``running``.
+
+    :param folder: Folder of the run
+    :param command: The words of the command line
+    :param content: Further entries
     """
 
     def __init__(self, folder: Path, command: list[str], **content: Any) -> None:
@@ -93,30 +98,34 @@ class RunRecord:
 
     def finish(self, status: str, **content: Any) -> None:
         """
+        Record how the run ended.
+
         :param status: ``"finished"``, ``"interrupted"`` or ``"failed"``
-        :param content: results to add
+        :param content: Results to add
         """
         self.content.update(status=status, seconds=round(time.monotonic() - self._start, 1), **content)
         self._write()
 
     def _write(self) -> None:
-        # first beside, then in place: who reads meanwhile finds the old or the new record, never half of one
-        beside = self.path.with_suffix(".json.tmp")
-        beside.write_text(json.dumps(self.content, indent=2) + "\n", encoding="utf-8")
-        beside.replace(self.path)
+        # A program that reads the record meanwhile gets the old or the new one, never a part, because replacing is atomic
+        temporary = self.path.with_suffix(".json.tmp")
+        temporary.write_text(json.dumps(self.content, indent=2) + "\n", encoding="utf-8")
+        temporary.replace(self.path)
 
 
 def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
     """
-    :param env_id: id of the environment
-    :param env: the environment, after it has run: StarCraft II tells its version only then
-    :return: {package: version} of the packages that it comes from, and what its own ``versions()`` says, if it has one
+    Return the versions of the packages that an environment comes from.
+
+    :param env_id: Id of the environment
+    :param env: The environment, after it has run, because StarCraft II reports its version only then
+    :return: {package: version} of the packages of its suite, and the result of its own ``versions()`` if it has that method
     """
-    family = SUITES.get(env_id.partition("/")[0])
+    suite = SUITES.get(env_id.partition("/")[0])
     found: dict[str, str] = {}
-    if family is not None:
+    if suite is not None:
         packages = metadata.packages_distributions()
-        found.update((name, metadata.version(name)) for module in family.modules for name in packages.get(module, ()))
+        found.update((name, metadata.version(name)) for module in suite.modules for name in packages.get(module, ()))
     if env.has_attr("versions"):
         found.update(env.env_method("versions")[0])
     return found
@@ -124,10 +133,12 @@ def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
 
 def find_team(run: str | os.PathLike[str], flag: str) -> Path:
     """
-    :param run: a run's folder, or a team's zip
-    :param flag: the flag or command that was given it, for the error message
-    :return: the zip
-    :raises ConfigError: if there is none
+    Return the path of a saved team.
+
+    :param run: Folder of a run, or zip of a team
+    :param flag: Flag or command that it was given to, for the error message
+    :return: Path of the zip
+    :raises ConfigError: If there is none
     """
     path = Path(run)
     if path.is_file():
@@ -142,9 +153,12 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
 
 def run_of(team: Path) -> tuple[str, str, Path] | None:
     """
-    :param team: a team's zip
-    :return: algorithm, environment id and configuration file of the run that saved it, or None if it lies in no run's folder
+    Return the run that saved a team.
+
+    :param team: Zip of a team
+    :return: Algorithm, environment id and configuration file of the run, or None if the zip is not in the folder of a run
     """
+    # Checkpoints lie one folder deeper than the final team
     for folder in list(team.resolve().parents)[:2]:
         if (folder / RECORD).is_file() and (folder / CONFIG).is_file():
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""One configuration, trained in a folder of its own."""
+"""Training of a team by a configuration, in a run folder of its own."""
 
 import sys
 import warnings
@@ -27,30 +27,31 @@ from sb3_belief.zoo.run_folder import (
     remove_run_folder,
 )
 
-# Evaluation copies get seeds far from those of the training copies
+# Added to the seed of the evaluation environment, so that its copies get other seeds than those of the training
 EVAL_SEED_OFFSET = 1_000_000
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     """
-    What a run does besides learning.
+    Options of a run that are not part of its configuration.
 
-    :param seed: of the team and its environments; None: drawn, and written down
-    :param log_folder: folder of all runs
-    :param tensorboard_log: folder for TensorBoard, None for none
-    :param eval_freq: evaluate every that many joint steps, -1 for never
-    :param eval_episodes: episodes of an evaluation
-    :param n_eval_envs: environment copies of an evaluation
-    :param save_freq: save the team every that many joint steps, -1 for never
-    :param vec_env: ``"dummy"`` or ``"subproc"``
-    :param device: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
-    :param num_threads: threads of torch, -1 for torch's own choice
-    :param jobs: processes that update the agents at once, see ``Team``
-    :param progress: whether to show a progress bar
-    :param trained_agent: a run's folder or a team's zip to go on from
-    :param verbose: 0 for silence, 1 for tables
-    :param command: the words of the command line, to be written down
+    :param seed: Seed of the team and its environments. None to draw one, which is recorded in ``run.json``
+    :param log_folder: Folder of all runs
+    :param tensorboard_log: Folder of the TensorBoard logs, or None for none
+    :param eval_freq: Number of joint steps between evaluations, -1 for no evaluation
+    :param eval_episodes: Number of episodes of an evaluation
+    :param n_eval_envs: Number of environment copies of an evaluation
+    :param save_freq: Number of joint steps between checkpoints, -1 to save the team at the end only
+    :param vec_env: ``"dummy"`` to step all environment copies in this process, ``"subproc"`` for a worker process per copy
+    :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
+    :param num_threads: Number of torch's threads, -1 for torch's default
+    :param jobs: Number of processes, the main one included, in which the agents with on-policy algorithms learn. Each agent
+        learns wholly in one of them. The result is the same for any number, to the bit on the CPU. See ``Team``
+    :param progress: Whether to show a progress bar
+    :param trained_agent: Folder of a run, or zip of a team, whose training is to be continued
+    :param verbose: 0 for no output, 1 for the team's tables, 2 for those of the agents too
+    :param command: The words of the command line, recorded in ``run.json``
     """
 
     seed: int | None = None
@@ -73,9 +74,11 @@ class TrainOptions:
 @dataclass(frozen=True)
 class TrainResult:
     """
-    :param folder: the run's folder
-    :param team: the trained team
-    :param finished: False if it was interrupted
+    Result of a run.
+
+    :param folder: Folder of the run
+    :param team: The trained team
+    :param finished: Whether the training finished. False if it was interrupted by Ctrl-C
     """
 
     folder: Path
@@ -85,12 +88,14 @@ class TrainResult:
 
 def train(config: RunConfig, options: TrainOptions) -> TrainResult:
     """
-    Train a team; all it writes goes to a new folder ``<log_folder>/<algo>/<env>_<k>/``. Ctrl-C ends the training and saves.
+    Train a team in a new folder ``<log_folder>/<algo>/<env>_<k>/``.
 
-    :param config: what to train, checked
-    :param options: what to do besides
-    :return: the folder and the team
-    :raises ConfigError: if the environment or the algorithm refuses its settings; nothing has been written then
+    Ctrl-C ends the training and saves the team.
+
+    :param config: Configuration of the team and its environment
+    :param options: Options of the run
+    :return: The folder and the trained team
+    :raises ConfigError: If the environment or the algorithm refuses its settings. Nothing has been written in this case
     """
     trained = None if options.trained_agent is None else find_team(options.trained_agent, "--trained-agent")
     seed = int(np.random.SeedSequence().generate_state(1)[0] % 2**31) if options.seed is None else options.seed
@@ -104,7 +109,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         if options.eval_freq > 0:
             eval_env = make_env(config, options.n_eval_envs, seed + EVAL_SEED_OFFSET, "dummy")
             stack.callback(eval_env.close)
-        # the team's logs go into the folder, so it must be there first; if the team is refused nothing stays behind
+        # The team opens its logs in the folder, so the folder must exist first. It is removed again if the team is refused
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:
             team = make_team(config, options, env, seed, trained, folder)
@@ -133,12 +138,14 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
 
 def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
     """
-    :param config: configuration
-    :param n_envs: number of copies
-    :param seed: copy i gets ``seed + i``
+    Make the environment that a configuration describes.
+
+    :param config: The configuration
+    :param n_envs: Number of environment copies
+    :param seed: Copy i is seeded with ``seed + i``
     :param vec_env: ``"dummy"`` or ``"subproc"``
-    :return: the team's environment
-    :raises ConfigError: if it refuses its settings
+    :return: The environment of the team
+    :raises ConfigError: If the environment refuses its settings
     """
     try:
         return make_team_env(
@@ -163,14 +170,16 @@ def make_team(
     folder: Path | None = None,
 ) -> Team:
     """
-    :param config: configuration
-    :param options: device, tables, TensorBoard folder and jobs are taken from them
-    :param env: what the team learns in
-    :param seed: of the team
-    :param trained: a saved team to load instead of making a new one
-    :param folder: where its CSV logs go, None for no logs
-    :return: the team
-    :raises ConfigError: if the algorithm refuses its settings or the environment
+    Make the team that a configuration describes, or load a saved one.
+
+    :param config: The configuration
+    :param options: Options of the run, of which the team takes device, verbosity, TensorBoard folder and jobs
+    :param env: Environment in which the team learns
+    :param seed: Seed of the team
+    :param trained: Zip of a saved team to load instead of making a new one
+    :param folder: Folder of the CSV logs, or None for no logs
+    :return: The team
+    :raises ConfigError: If the algorithm refuses its settings or the environment
     """
     common: dict[str, Any] = dict(
         device=options.device,
@@ -186,7 +195,7 @@ def make_team(
         return Team(
             config.algo_class, config.policy, env, seed=seed, normalize=config.normalize, **common, **config.algo_kwargs
         )
-    # SB3 checks action spaces and batch sizes by assertions
+    # An AssertionError is a refusal too: SB3 checks action spaces and batch sizes by assertions
     except (ValueError, TypeError, AssertionError) as error:
         raise ConfigError(f"{config.source}: {config.algo} cannot be set up on {config.env_id}: {error}") from error
 
@@ -196,7 +205,7 @@ def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, com
     for agent, model in team.agents.items():
         if type(model) is not config.algo_class:
             raise ValueError(f"{agent!r} in {str(trained)!r} is a {type(model).__name__}, not a {config.algo_class.__name__}")
-    # Loading seeds the environment as in the run before: going on is not to meet the same episodes again
+    # Loading seeds the environment as in the run before. With this run's own seed it does not repeat the same episodes
     env.seed(seed)
     return team
 
@@ -205,12 +214,12 @@ def _callbacks(
     team: Team, config: RunConfig, options: TrainOptions, folder: Path, eval_env: TeamVecEnv | None
 ) -> list[BaseCallback]:
     callbacks: list[BaseCallback] = [callback(**kwargs) for callback, kwargs in config.callbacks]
-    # SB3's callbacks count calls, which come once per step of all the copies together
+    # SB3's callbacks count their calls. There is one call for each step of all copies, which is n_envs joint steps
     if options.save_freq > 0:
-        every = max(options.save_freq // config.n_envs, 1)
-        callbacks.append(CheckpointCallback(every, str(folder / CHECKPOINTS), name_prefix="team", verbose=options.verbose))
+        save_freq = max(options.save_freq // config.n_envs, 1)
+        callbacks.append(CheckpointCallback(save_freq, str(folder / CHECKPOINTS), name_prefix="team", verbose=options.verbose))
     if eval_env is not None:
-        # Training in worker processes, evaluation in this one: intended
+        # SB3 warns if only one of the two environments has worker processes, which is intended here
         warnings.filterwarnings("ignore", message="Training and eval env are not of the same type")
         callbacks.append(
             (MaskableEvalCallback if team.takes_masks else EvalCallback)(
@@ -236,17 +245,19 @@ def _learn(
             config.n_timesteps,
             callback=callbacks or None,
             progress_bar=options.progress,
-            # a team that goes on keeps counting its steps
+            # A team that continues its training continues counting its steps
             reset_num_timesteps=options.trained_agent is None,
         )
         status = "finished"
     except KeyboardInterrupt:
         status = "interrupted"
     finally:
+        results: dict[str, Any] = {"timesteps": team.num_timesteps}
+        # After a failure the environment may be broken as well, so it is not asked for its versions
         if status != "failed":
             team.save(folder / TEAM)
-        told = {"environment": environment_versions(config.env_id, env)} if status != "failed" else {}
-        record.finish(status, timesteps=team.num_timesteps, **told)
+            results["environment"] = environment_versions(config.env_id, env)
+        record.finish(status, **results)
     if options.verbose or status == "interrupted":
         print(f"{status.capitalize()} after {team.num_timesteps} joint steps. Saved: {folder / TEAM}")
     return TrainResult(folder, team, status == "finished")

@@ -1,4 +1,4 @@
-"""Reading YAML as data: nothing in a file is ever evaluated, and nothing in it is silently dropped."""
+"""Reading YAML as plain data: nothing in a file is evaluated, and no key is silently dropped."""
 
 import re
 from collections.abc import Iterable
@@ -11,12 +11,17 @@ from sb3_belief.zoo.errors import ConfigError
 
 
 class _DataLoader(yaml.SafeLoader):
-    """PyYAML's safe loader (no tag makes an object), which refuses duplicate keys and reads ``3e-4`` as a number."""
+    """
+    PyYAML's safe loader, with which no tag makes an object.
+
+    In addition it refuses duplicate keys and keys that are not strings, and reads ``3e-4`` as a number.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        # PyYAML keeps the last of two equal keys, so a setting further up would be lost without a word
+        # PyYAML keeps the last of two equal keys, so the first one would be lost silently
         seen: set[Any] = set()
         for key_node, _ in node.value:
+            # "<<" merges another mapping, whose keys may be overridden
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
@@ -28,7 +33,8 @@ class _DataLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-# YAML 1.1 wants a dot and a sign in a float's exponent form; everyone writes 3e-4 and means the number (as YAML 1.2 does)
+# PyYAML follows YAML 1.1, in which a float in exponent form needs a dot and a sign, so that 3e-4 is a string. Users mean the
+# number, as in YAML 1.2
 _DataLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
@@ -36,10 +42,12 @@ _DataLoader.add_implicit_resolver(
 
 def parse(text: str, where: str) -> Any:
     """
+    Parse YAML as plain data.
+
     :param text: YAML
-    :param where: the file or flag it comes from, for the error message
-    :return: its value, built of dict, list, str, int, float, bool, None (and dates)
-    :raises ConfigError: for text that is not plain YAML data
+    :param where: File or flag that it comes from, for the error message
+    :return: Value made of dict, list, str, int, float, bool and None (and dates)
+    :raises ConfigError: For text that is not plain YAML data
     """
     try:
         return yaml.load(text, Loader=_DataLoader)
@@ -52,9 +60,11 @@ def parse(text: str, where: str) -> Any:
 
 def read_file(path: Path) -> dict[str, Any]:
     """
+    Read a configuration file.
+
     :param path: YAML file whose top level is a mapping
-    :return: the mapping
-    :raises ConfigError: if the file cannot be read or is no mapping
+    :return: The mapping
+    :raises ConfigError: If the file cannot be read or is not a mapping
     """
     try:
         data = parse(path.read_text(encoding="utf-8"), str(path))
@@ -67,12 +77,14 @@ def read_file(path: Path) -> dict[str, Any]:
 
 def parse_pairs(pairs: Iterable[str], flag: str) -> dict[str, Any]:
     """
-    Read ``key:value`` pairs of the command line. A dot in the key names a nested one: ``policy_kwargs.net_arch:[64,64]``.
+    Read the ``key:value`` pairs that follow a flag on the command line.
 
-    :param pairs: the words that followed the flag
-    :param flag: the flag's name, for the error message
-    :return: nested dict
-    :raises ConfigError: for a word without a colon, or a key given twice
+    A dot in a key stands for a nested mapping, as in ``policy_kwargs.net_arch:[64,64]``. Values are read as YAML.
+
+    :param pairs: The words that follow the flag
+    :param flag: Name of the flag, for the error message
+    :return: Nested dict
+    :raises ConfigError: For a word without a colon, or a key that is given twice
     """
     result: dict[str, Any] = {}
     for pair in pairs:
@@ -93,9 +105,11 @@ def parse_pairs(pairs: Iterable[str], flag: str) -> dict[str, Any]:
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """
-    :param base: settings
-    :param over: settings that win; nested mappings are merged, everything else is replaced
-    :return: a new dict
+    Return settings with other settings merged over them.
+
+    :param base: Settings
+    :param over: Settings that take precedence. Nested mappings are merged, all other values are replaced
+    :return: A new dict. Neither argument is changed
     """
     merged = dict(base)
     for key, value in over.items():

@@ -39,9 +39,9 @@ def committed(algo):
 
 @pytest.mark.parametrize("algo, env_id", [(algo, env_id) for algo in ALGOS for env_id in committed(algo)])
 def test_every_committed_entry_is_valid(algo, env_id):
-    family = SUITES.get(env_id.partition("/")[0])
-    if family is not None and family.missing():
-        pytest.skip(f"needs {' and '.join(family.missing())}")
+    suite = SUITES.get(env_id.partition("/")[0])
+    if suite is not None and suite.missing():
+        pytest.skip(f"needs {' and '.join(suite.missing())}")
     config = load_config(algo, env_id)
     assert config.n_timesteps > 0
     # what the algorithm is given is what its constructor takes

@@ -1,4 +1,4 @@
-"""Environments by name on the command line: families, one's own, the list of them and the check."""
+"""Environments by name on the command line: suites, a user's own, the list of them and the check."""
 
 import sys
 
@@ -46,7 +46,7 @@ def train(env_id, folder, *words):
     return train_main([*flags, "--eval-freq", "-1", "-params", *TINY, "history_length:20", *words])
 
 
-def test_an_environment_of_a_family_is_trained_and_replayed(tmp_path, capsys):
+def test_an_environment_of_a_suite_is_trained_and_replayed(tmp_path, capsys):
     words = ["--env-kwargs", "radius:0.8", "max_cycles:5", "-tb", str(tmp_path / "tb")]
     assert train(SPREAD, tmp_path / "logs", *words) == 0
     folder = tmp_path / "logs" / "belief_ppo" / "mpe-simple_spread_v3_1"
@@ -70,7 +70,7 @@ def test_ones_own_environment_is_trained_and_replayed(own_module, capsys):
     folder = own_module / "logs" / "belief_ppo" / "my_toys-make_1"
     assert list(Team.load(folder / "team.zip").agents) == ["agent_0", "agent_1", "agent_2"]
     capsys.readouterr()
-    # it has pictures, but what makes it takes no render_mode
+    # it has images, but the callable that makes it takes no render_mode
     assert main(["enjoy", str(folder), *allow]) == 0
     assert "7 steps" in capsys.readouterr().out
     # a run's folder is data as well
@@ -127,7 +127,7 @@ def test_sections_are_looked_up_by_the_whole_id(tmp_path):
         load_config("ppo", SPREAD, str(path))
 
 
-def test_arguments_of_a_family_are_checked(capsys):
+def test_arguments_of_a_suite_are_checked(capsys):
     assert train(SPREAD, "nowhere", "--env-kwargs", "radius:wide") == 2
     assert "radius: must be a number or null, not 'wide'" in capsys.readouterr().err
     # these are known to the environment only
@@ -149,7 +149,7 @@ def test_the_list_says_what_is_there_and_how_to_get_the_rest(monkeypatch, capsys
     said = capsys.readouterr().out
     assert "pettingzoo/sisl.pursuit" in said and "..." not in said
     assert main(["envs", "list", "smack"]) == 2
-    assert "unknown family 'smack'. Did you mean 'smac'" in capsys.readouterr().err
+    assert "unknown suite 'smack'. Did you mean 'smac'" in capsys.readouterr().err
 
 
 def test_the_check_says_what_to_change(own_module, capsys):
@@ -166,7 +166,7 @@ def test_the_check_says_what_to_change(own_module, capsys):
         assert capsys.readouterr().err.startswith("Refused: envs check: ")
 
 
-def test_a_short_family_is_listed_in_full(monkeypatch):
+def test_a_suite_that_is_asked_for_is_listed_in_full(monkeypatch):
     monkeypatch.setattr(envs, "_SHORT", 3)
     assert "... and 9 more: sb3-belief envs list mpe" in envs.list_envs()
     assert "..." not in envs.list_envs("mpe")

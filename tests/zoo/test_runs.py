@@ -126,7 +126,7 @@ def test_a_run_goes_on_from_a_saved_team(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["-params", "n_steps:40"], "'n_steps' cannot be set with -i, the saved models bring their settings"),
+        (["-params", "n_steps:40"], "'n_steps' cannot be set with -i, the saved models keep their settings"),
         (["-params", "n_env:40"], "Did you mean 'n_envs'"),
         (["--algo", "a2c"], "'a2c' does not fit the saved team, which is of 'ppo'"),
         (["--env", "traffic-junction-medium"], "cannot be set up on traffic-junction-medium"),
@@ -213,8 +213,8 @@ def test_a_run_notes_the_versions_of_its_environment(tmp_path, monkeypatch):
     assert train_tiny("ppo", tmp_path, "-n", "80") == 0
     flags = ["--env", "mpe/simple_spread_v3", "-n", "80", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
     assert train_main(["--algo", "ppo", *flags, "-params", *TINY["ppo"]]) == 0
-    told = {path.parent.name: json.loads(path.read_text())["environment"] for path in tmp_path.rglob("run.json")}
-    assert told == {f"{EASY}_1": {"map": "junction"}, "mpe-simple_spread_v3_1": {"mpe2": metadata.version("mpe2")}}
+    found = {path.parent.name: json.loads(path.read_text())["environment"] for path in tmp_path.rglob("run.json")}
+    assert found == {f"{EASY}_1": {"map": "junction"}, "mpe-simple_spread_v3_1": {"mpe2": metadata.version("mpe2")}}
 
 
 def test_normalize_gives_each_agent_its_own_statistics(tmp_path):
@@ -309,7 +309,7 @@ def test_an_environment_without_pictures_can_be_trained_and_played(tmp_path, cap
     assert main(["enjoy", folder, "--episodes", "2"]) == 0
     assert capsys.readouterr().out.count("10 steps") == 2
     assert main(["enjoy", folder, "--output", str(tmp_path / "a.gif")]) == 2
-    assert "no pictures" in capsys.readouterr().err
+    assert "no images" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def test_an_environment_without_pictures_can_be_trained_and_played(tmp_path, cap
         (["nowhere"], "enjoy: no file or folder 'nowhere'"),
         (["RUN", "--output", "episode.avi"], "--output: 'episode.avi' must end in .gif or .mp4"),
         (["RUN", "--env-kwargs", "arival_rate:0.1"], "Did you mean 'arrival_rate'"),
-        (["stray.zip"], "lies in no run's folder"),
+        (["stray.zip"], "is not in the folder of a run"),
     ],
 )
 def test_what_enjoy_refuses(words, message, run, tmp_path, monkeypatch, capsys):
