@@ -40,11 +40,13 @@ def test_gradients_of_queries_keys_and_values(n_queries, n_rows, n_selected, wid
 @pytest.mark.parametrize("n_queries, n_rows, n_selected, width", [(1, 1, 1, 1), (5, 9, 3, 4), (7, 6, 6, 2), (64, 800, 40, 16)])
 def test_the_fast_path_agrees_with_the_reference(n_queries, n_rows, n_selected, width):
     th.manual_seed(0)
-    inputs = [th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows, n_rows)]
+    queries, keys, values = inputs = [
+        th.randn(n, width, dtype=th.float64, requires_grad=True) for n in (n_queries, n_rows, n_rows)
+    ]
     selected, upstream = chosen(n_queries, n_rows, n_selected), th.randn(n_queries, width, dtype=th.float64)
-    means, weights = attend(*inputs, selected)
-    expected_means, expected_weights = reference_attention(*inputs, selected)
-    th.testing.assert_close(expected_means, plain(*inputs, selected), rtol=1e-12, atol=1e-12)
+    means, weights = attend(queries, keys, values, selected)
+    expected_means, expected_weights = reference_attention(queries, keys, values, selected)
+    th.testing.assert_close(expected_means, plain(queries, keys, values, selected), rtol=1e-12, atol=1e-12)
     th.testing.assert_close(means, expected_means, rtol=1e-12, atol=1e-12)
     th.testing.assert_close(weights, expected_weights, rtol=1e-12, atol=1e-12)
     expected = th.autograd.grad(expected_means, inputs, upstream)

@@ -108,7 +108,7 @@ def test_early_stopping_and_clipped_values_are_sb3s():
 def test_a_callback_that_asks_the_policy_does_not_change_what_is_stored():
     class Asks(BaseCallback):
         def _on_step(self):
-            obs = obs_as_tensor(self.locals["new_obs"], self.model.device)
+            obs: Any = obs_as_tensor(self.locals["new_obs"], self.model.device)
             with th.no_grad():
                 # All copies, then greedily, then the first copy alone
                 self.model.policy(obs)

@@ -1,5 +1,5 @@
 """
-SMAC and SMACv2 without StarCraft II: the same classes, methods and faults around a small battle. It imitates SMAC at d6aab33 and
+SMAC and SMACv2 without StarCraft II: the same classes, methods and faults around a small battle, as of SMAC at d6aab33 and
 SMACv2 at 577ab5a; ``test_fake_starcraft.py`` compares the signatures with the real packages where these are installed.
 """
 
