@@ -1,265 +1,329 @@
-"""Whatever goes wrong: nothing hangs, nothing that was learned or saved is lost, and it is said what happened."""
+"""What an environment or an actor gets wrong while it runs is said with agent, environment copy and step."""
 
-import os
-import signal
-import sys
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-import torch as th
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from gymnasium import spaces
 
-from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
-from tests.team.toy_envs import FaultyEnv, ToyEnv
+from tests.team.helpers import make_team_env
+from tests.team.toy_envs import MaskedEnv, MixedEnv, PartneredEnv, ToyEnv
 
-
-@pytest.fixture(autouse=True)
-def ctrl_c_interrupts():
-    """Also where the tests run in the background, where a shell lets Ctrl-C be ignored."""
-    old = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, old)
+ACTIONS: dict[str, Any] = {f"agent_{i}": np.zeros(2, int) for i in range(3)}
 
 
-def make_team(env=None, n_agents=3, **kwargs):
-    env = env or make_team_env(partial(ToyEnv, n_agents=n_agents), n_envs=2)
-    return Team(PPO, "MlpPolicy", env, seed=0, **{**PPO_KWARGS, **kwargs})
-
-
-def notes(error):
-    return " ".join(getattr(error, "__notes__", []))
-
-
-def works_again(team, tmp_path):
-    """Saving and learning go on as if nothing had been."""
-    team.save(tmp_path / "after")
-    before = {agent: parameters(model) for agent, model in team.agents.items()}
-    team.learn(32)
-    assert team.num_timesteps == 32
-    assert all(not th.equal(before[agent], parameters(model)) for agent, model in team.agents.items())
-    loaded = Team.load(tmp_path / "after")
-    assert all(th.equal(before[agent], parameters(model)) for agent, model in loaded.agents.items())
-
-
-class Raises(BaseCallback):
+class Faulty(ToyEnv):
     """
-    Raises or sends Ctrl-C at a step.
+    A ``ToyEnv`` of three agents whose second copy has one fault, at step 3 of its second episode (or at the reset before).
 
-    :param at: count of calls
-    :param error: what to raise; None: Ctrl-C
+    :param fault: name of the method that makes it
     """
 
-    def __init__(self, at, error=None):
-        super().__init__()
-        self.at, self.error = at, error
+    made = 0
 
-    def _on_step(self):
-        if self.n_calls == self.at:
-            if self.error is not None:
-                raise self.error
-            os.kill(os.getpid(), signal.SIGINT)
-        return True
+    def __init__(self, fault: str):
+        super().__init__(n_agents=3, limit=4)
+        self.fault, self.episode = fault, 0
+        self.number = Faulty.made % 2
+        Faulty.made += 1
+
+    def reset(self, seed=None, options=None):
+        self.episode += 1
+        obs, infos = super().reset(seed)
+        if self.number and self.episode == 2 and self.fault.startswith("reset_"):
+            getattr(self, self.fault)(obs)
+        return obs, infos
+
+    def step(self, actions):
+        result = super().step(actions)
+        if self.number and self.episode == 2 and self.t == 3 and not self.fault.startswith("reset_"):
+            getattr(self, self.fault)(*result)
+        return result
+
+    def visibility(self):
+        rows = {agent: [True, True] for agent in self.possible_agents}
+        if self.number and self.episode == 2 and self.t == 3:
+            rows |= {"rows": {"agent_1": [True]}, "stranger": {"agent_7": [True, True]}}.get(self.fault, {})
+            if self.fault == "no_dict":
+                return list(rows.values())
+        return rows
+
+    def rows(self, *parts):
+        pass
+
+    stranger = no_dict = no_fault = rows
+
+    def reset_nan(self, obs):
+        obs["agent_1"][0] = np.nan
+
+    def reset_shape(self, obs):
+        obs["agent_1"] = np.zeros((2, 1), np.float32)
+
+    def reset_missing(self, obs):
+        del obs["agent_1"]
+
+    def reset_renamed(self, obs):
+        self.agents[1] = "agent_7"
+
+    def nan(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"][1] = np.nan
+
+    def infinite(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"][1] = -np.inf
+
+    def nan_reward(self, obs, rewards, terminations, truncations, infos):
+        rewards["agent_1"] = np.nan
+
+    def nan_at_the_end(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"][1] = np.nan
+        truncations.update(dict.fromkeys(truncations, True))
+        self.agents = []
+
+    def nan_of_who_leaves(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"][1] = np.nan
+        truncations["agent_1"] = True
+        self.agents = ["agent_0", "agent_2"]
+
+    def shape(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"] = np.zeros(3, np.float32)
+
+    def nothing(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_1"] = None
+
+    def missing(self, obs, rewards, terminations, truncations, infos):
+        del obs["agent_1"]
+
+    def no_reward(self, obs, rewards, terminations, truncations, infos):
+        del rewards["agent_1"]
+
+    def renamed(self, obs, rewards, terminations, truncations, infos):
+        obs["agent_7"] = obs.pop("agent_1")
+
+    def renamed_reward(self, obs, rewards, terminations, truncations, infos):
+        rewards["agent_7"] = rewards.pop("agent_1")
+
+    def renamed_agent(self, obs, rewards, terminations, truncations, infos):
+        self.agents[1] = "agent_7"
 
 
-class Cleans(PPO):
-    """Notes whether its ``finally`` blocks run."""
-
-    cleaned = 0
-
-    def collect_rollouts(self, *args, **kwargs):
-        try:
-            return super().collect_rollouts(*args, **kwargs)
-        finally:
-            Cleans.cleaned += 1
+def run(env):
+    env.reset()
+    for _ in range(9):
+        env.step(ACTIONS)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_an_agent_raises(tmp_path):
-    Cleans.cleaned = 0
-    env = make_team_env(partial(ToyEnv, n_agents=3), n_envs=2)
-    team = Team(Cleans, "MlpPolicy", env, seed=0, **PPO_KWARGS)
-    record, state = Record(), (th.get_rng_state(), th.is_grad_enabled())
-    with pytest.raises(ZeroDivisionError, match="by hand") as caught:
-        team.learn(64, callback=record, agent_callbacks={"agent_1": Raises(5, ZeroDivisionError("by hand"))})
-    assert "agent 'agent_1'" in notes(caught.value) and "joint step 5" in notes(caught.value)
-    assert record.steps == 4 and team.num_timesteps == 8
-    assert Cleans.cleaned == 3
-    assert th.equal(state[0], th.get_rng_state()) and state[1] == th.is_grad_enabled()
-    works_again(team, tmp_path)
+FAULTS = [
+    ("reset_nan", "The observation of 'agent_1' in environment copy 1 at reset holds nan (index 0)"),
+    ("reset_shape", "The observation of 'agent_1' in environment copy 1 at reset has the shape (2, 1)"),
+    ("reset_missing", "The environment's observations lack 'agent_1' in environment copy 1 at reset"),
+    ("reset_renamed", "The environment's agents have 'agent_7' in environment copy 1 at reset"),
+    ("nan", "The observation of 'agent_1' in environment copy 1 at step 3 holds nan (index 1)"),
+    ("infinite", "The observation of 'agent_1' in environment copy 1 at step 3 holds -inf"),
+    ("nan_reward", "The reward of 'agent_1' in environment copy 1 at step 3 holds nan"),
+    ("nan_at_the_end", "The observation of 'agent_1' in environment copy 1 at step 3 holds nan"),
+    ("nan_of_who_leaves", "The observation of 'agent_1' in environment copy 1 at step 3 holds nan"),
+    ("shape", "The observation of 'agent_1' in environment copy 1 at step 3 has the shape (3,)"),
+    ("nothing", "The observation of 'agent_1' in environment copy 1 at step 3 has the shape () and type object"),
+    ("missing", "The environment's observations lack 'agent_1' in environment copy 1 at step 3"),
+    ("no_reward", "The environment's rewards lack 'agent_1' in environment copy 1 at step 3"),
+    ("renamed", "The environment's observations have 'agent_7' in environment copy 1 at step 3"),
+    ("renamed_reward", "The environment's rewards have 'agent_7' in environment copy 1 at step 3"),
+    ("renamed_agent", "The environment's agents have 'agent_7' in environment copy 1 at step 3"),
+    ("rows", "visibility() has 1 flags for 'agent_1' in environment copy 1 at step 3"),
+    ("stranger", "visibility() has an entry for 'agent_7' in environment copy 1 at step 3"),
+    ("no_dict", "visibility() returned a list in environment copy 1 at step 3"),
+]
 
 
-@pytest.mark.parametrize("who", ["agent_0", "agent_2", "team"])
-def test_a_callback_stops_all_after_this_step(who, tmp_path):
-    team = make_team()
-    records = {name: Record(stop_at=11 if name == who else None) for name in ("agent_0", "agent_1", "agent_2", "team")}
-    own = {agent: records[agent] for agent in team.possible_agents}
-    team.learn(1000, callback=records["team"], agent_callbacks=own)
-    assert {name: record.steps for name, record in records.items()} == dict.fromkeys(records, 11)
-    assert all(record.events[-1] == "training end" for record in records.values())
-    assert team.num_timesteps == 22 and {model.num_timesteps for model in team.agents.values()} == {22}
-    # the environment made no further step: two copies, episodes of 7
-    assert team.get_env().get_attr("t") == [4, 4]
-    # SB3 drops the step at which a callback stops, so going on means new episodes
-    record = Record(keep=("dones",))
-    team.learn(32, reset_num_timesteps=False, callback=record)
-    assert team.num_timesteps == 22 + 32
-    assert [int(kept["dones"][0]) for kept in record.kept[:14]] == ([0] * 6 + [1]) * 2
-    works_again(team, tmp_path)
+@pytest.mark.parametrize(("fault", "message"), FAULTS)
+def test_an_environment_that_goes_wrong(fault, message):
+    Faulty.made = 0
+    env = make_team_env(partial(Faulty, fault), n_envs=2)
+    with pytest.raises(ValueError) as error:
+        run(env)
+    assert str(error.value).startswith(message)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
-@pytest.mark.parametrize("who", ["agent_1", "team"])
-def test_ctrl_c(who, vec_env, tmp_path):
-    env = make_team_env(partial(ToyEnv, n_agents=3), n_envs=2, vec_env=vec_env)
-    team = make_team(env)
-    interrupt = Raises(13)
-    with pytest.raises(KeyboardInterrupt) as caught:
-        team.learn(
-            64,
-            callback=interrupt if who == "team" else None,
-            agent_callbacks={"agent_1": interrupt if who == "agent_1" else None},
-        )
-    assert "joint step 13" in notes(caught.value)
-    works_again(team, tmp_path)
+def test_without_a_fault_it_runs():
+    Faulty.made = 0
+    run(make_team_env(partial(Faulty, "no_fault"), n_envs=2))
+
+
+def test_numbers_are_looked_at_in_worker_processes_too():
+    # a worker counts the environments it has made itself: both copies are the first one there
+    env = make_team_env(partial(AlwaysNaN, 2), n_envs=2, vec_env="subproc")
+    env.reset()
+    env.step(ACTIONS)
+    with pytest.raises(ValueError, match="The observation of 'agent_0' in environment copy 0 at step 2 holds nan"):
+        env.step(ACTIONS)
     env.close()
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_ctrl_c_while_workers_step(tmp_path):
-    """The results under way do not come back as those of a later step."""
-    env = make_team_env(ToyEnv, n_envs=2, vec_env="subproc")
-    team = make_team(env)
-    await_steps, calls = env.venv._await_steps, []
+class AlwaysNaN(ToyEnv):
+    """:param at: step at which an observation is not a number"""
 
-    def interrupted():
-        calls.append(1)
-        if len(calls) == 6:
-            os.kill(os.getpid(), signal.SIGINT)
-        await_steps()
+    def __init__(self, at):
+        super().__init__(n_agents=3)
+        self.at = at
 
-    env.venv._await_steps = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        team.learn(64)
-    # an interruption means new episodes, even where the counts go on
-    record = Record(keep=("infos", "dones"))
-    team.learn(32, reset_num_timesteps=False, callback=record)
-    assert [int(kept["dones"][0]) for kept in record.kept[:14]] == ([0] * 6 + [1]) * 2
-    assert [kept["infos"][0]["episode"]["l"] for kept in record.kept if kept["dones"][0]][:2] == [7, 7]
-    works_again(team, tmp_path)
+    def observations(self):
+        obs = super().observations()
+        if self.t == self.at:
+            obs["agent_0"][:] = np.nan
+        return obs
+
+
+@pytest.mark.filterwarnings("error")
+def test_large_numbers_are_numbers():
+    class Large(ToyEnv):
+        def observations(self):
+            return {agent: np.full(2, 3e38, np.float32) for agent in self.agents}
+
+    env = make_team_env(partial(Large, n_agents=3), n_envs=2)
+    run(env)
+
+
+MIXED: dict[str, Any] = {
+    "zeta": np.array([0, 1]),
+    "box": np.zeros((2, 2), np.float32),
+    "multi": np.zeros((2, 2), int),
+    "binary": np.zeros((2, 2), np.int8),
+}
+
+
+@pytest.mark.parametrize(
+    ("agent", "actions", "said"),
+    [
+        ("zeta", [0, 3], "3 (type int64)"),
+        ("zeta", [0, -1], "-1 (type int64)"),
+        ("zeta", [0.0, 1.5], "0.0 (type float64)"),
+        ("box", [[0.0, 0.0], [1.0, 1.1]], "[1.0, 1.1] (type float64)"),
+        ("box", [[0.0, 0.0], [0.0, np.nan]], "[0.0, nan] (type float64)"),
+        ("multi", [[0, 0], [0, 3]], "[0, 3] (type int64)"),
+        ("binary", [[0, 0], [2, 0]], "[2, 0] (type int64)"),
+    ],
+)
+def test_actions_outside_of_their_space(agent, actions, said):
+    env = make_team_env(MixedEnv, n_envs=2, seed=0)
+    env.reset()
+    for _ in range(2):
+        env.step(MIXED)
+    copy = 0 if "float64" in said and agent == "zeta" else 1
+    with pytest.raises(ValueError) as error:
+        env.step({**MIXED, agent: np.array(actions)})
+    expected = f"The action of {agent!r} in environment copy {copy} at step 3 is {said}, which is not in its action space"
+    assert str(error.value).startswith(expected)
+    # nothing was stepped
+    assert env.get_attr("t") == [2, 2]
+
+
+def test_what_rescaling_rounds_is_in_the_space():
+    env = make_team_env(PartneredEnv)
+    env.reset()
+    env.step({"arrow": np.zeros(1, int), "ball": np.full((1, 1), np.nextafter(np.float32(1), np.float32(2)))})
+
+
+class NoWay(MaskedEnv):
+    """:param at: step after which agent_1 can do nothing"""
+
+    def __init__(self, at):
+        super().__init__(n_agents=3, limit=5)
+        self.at = at
+
+    def infos(self):
+        infos = super().infos()
+        if self.t == self.at:
+            infos["agent_1"] = {"action_mask": np.zeros(3, bool)}
+        return infos
+
+
+@pytest.mark.parametrize(("at", "place"), [(0, "at reset"), (2, "at step 2")])
+def test_a_mask_that_allows_nothing(at, place):
+    env = make_team_env(partial(NoWay, at), n_envs=2)
+    with pytest.raises(ValueError, match=f"The action mask of 'agent_1' in environment copy 0 {place} allows no action"):
+        env.reset()
+        for _ in range(3):
+            env.step({agent: np.argmax(env.action_masks().get(agent, np.ones((2, 3))), axis=1) for agent in ACTIONS})
+
+
+def test_a_mask_of_the_wrong_size():
+    class Short(MaskedEnv):
+        def infos(self):
+            return {agent: {"action_mask": np.ones(2, bool)} for agent in self.agents}
+
+    message = "mask of 'agent_0' in environment copy 0 at reset must have 3 entries, one for each action, got 2"
+    with pytest.raises(ValueError, match=message):
+        make_team_env(Short).reset()
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_nested_observations(vec_env):
+    with pytest.raises(ValueError, match="The observation space of 'agent_0' is nested"):
+        make_team_env(Nested, n_envs=2, vec_env=vec_env)
+
+
+class Nested(ToyEnv):
+    def observation_space(self, agent):
+        return spaces.Dict({"a": spaces.Box(0, 1, (2,), np.float32)})
+
+
+class Wordy(ToyEnv):
+    def observation_space(self, agent):
+        return spaces.Text(5)
+
+
+def test_observations_of_a_kind_that_no_model_takes():
+    with pytest.raises(ValueError, match=r"The observation space of 'agent_0' is Text.*; allowed are Discrete, MultiDiscrete"):
+        make_team_env(Wordy)
+
+
+def test_copies_that_differ():
+    sizes = iter([2, 3])
+    with pytest.raises(ValueError, match=r"same possible_agents, but those of environment copy 1 are .*agent_2"):
+        make_team_env(lambda: ToyEnv(next(sizes)), n_envs=2)
+    one = ToyEnv()
+    with pytest.raises(ValueError, match="one and the same environment: return a new one at each call"):
+        make_team_env(lambda: one, n_envs=2)
+
+
+# Visibility as the user says
+
+
+def looks_left(env):
+    """Each sees who comes before it in the list, from the second step on."""
+    agents = env.possible_agents
+    return {agent: np.array([env.t > 1 and j < i for j in range(len(agents)) if j != i]) for i, agent in enumerate(agents)}
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_the_user_says_who_is_visible(vec_env):
+    env = make_team_env(partial(ToyEnv, n_agents=3, limit=2), n_envs=2, vec_env=vec_env, visibility=looks_left)
+    env.reset()
+    assert not env.step(ACTIONS)[3][1]["visible"].any()
+    # the last step of an episode included
+    _, _, dones, infos = env.step(ACTIONS)
+    assert dones.all()
+    assert infos[1]["visible"].tolist() == [[False, False], [True, False], [True, True]]
     env.close()
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
-def test_the_environment_fails(vec_env, tmp_path):
-    env = make_team_env(partial(FaultyEnv, "raise"), n_envs=2, vec_env=vec_env)
-    team = make_team(env)
-    with pytest.raises((ArithmeticError, RuntimeError)) as caught:
-        team.learn(1000)
-    if vec_env == "dummy":
-        assert str(caught.value) == "the toy broke"
-    else:
-        assert "worker process 0 (exit code 1)" in str(caught.value)
-        assert not any(process.is_alive() for process in env.venv.processes)
-    # episodes of 7, and the third step of the second one
-    assert "joint step 10" in notes(caught.value) and team.num_timesteps == 18
-    team.set_env(make_team_env(ToyEnv, n_envs=2))
-    works_again(team, tmp_path)
+def test_who_has_left_is_not_visible_whatever_the_user_says():
+    env = make_team_env(PartneredEnv, visibility=lambda env: {agent: np.ones(3) for agent in env.possible_agents})
+    env.reset()
+    actions: dict[str, Any] = {"arrow": np.zeros(1, int), "ball": np.zeros((1, 1), np.float32)}
+    visible = [env.step(actions)[3][0]["visible"].tolist() for _ in range(4)]
+    assert visible[2] == [[True] * 3, [True] * 3] and visible[3] == [[False, True, True], [False] * 3]
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_worker_dies(tmp_path):
-    env = make_team_env(ToyEnv, n_envs=2, vec_env="subproc")
-    team = make_team(env)
-
-    class Kill(BaseCallback):
-        def _on_step(self):
-            if self.n_calls == 9:
-                os.kill(env.venv.processes[1].pid, signal.SIGKILL)
-            return True
-
-    with pytest.raises(RuntimeError, match=r"worker process 1 \(exit code -9\) died") as caught:
-        team.learn(1000, callback=Kill())
-    assert "joint step 10" in notes(caught.value)
-    assert not any(process.is_alive() for process in env.venv.processes)
-    team.set_env(make_team_env(ToyEnv, n_envs=2))
-    works_again(team, tmp_path)
+def test_what_the_user_says_is_looked_at_too():
+    env = make_team_env(ToyEnv, visibility=lambda env: {"agent_1": np.ones(2)})
+    env.reset()
+    with pytest.raises(ValueError, match=r"visibility\(\) has 2 flags for 'agent_1' in environment copy 0 at step 1"):
+        env.step({agent: np.zeros(1, int) for agent in env.possible_agents})
 
 
-def test_a_fault_while_saving_keeps_the_old_file(tmp_path, monkeypatch):
-    team = make_team()
-    team.save(tmp_path / "team")
-    old = (tmp_path / "team.zip").read_bytes()
-
-    def fails(*args, **kwargs):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(team.agents["agent_2"], "save", fails)
-    with pytest.raises(OSError, match="disk full"):
-        team.save(tmp_path / "team")
-    assert (tmp_path / "team.zip").read_bytes() == old
-    assert [path.name for path in tmp_path.iterdir()] == ["team.zip"]
-
-
-def test_learn_within_learn_is_refused():
-    team = make_team()
-    errors = []
-
-    class Inside(BaseCallback):
-        def _on_step(self):
-            for call in (lambda: team.learn(8), lambda: team.set_env(make_team_env(ToyEnv, n_envs=2))):
-                try:
-                    call()
-                except RuntimeError as error:
-                    errors.append(str(error))
-            return False
-
-    team.learn(64, callback=Inside())
-    assert "learning already" in errors[0] and "while it learns" in errors[1]
-    team.learn(16)
-
-
-def test_an_agent_does_not_learn_alone():
-    team = make_team()
-    with pytest.raises(RuntimeError, match="only together with the others'"):
-        team.agents["agent_0"].learn(8)
-    team.learn(16)
-    with pytest.raises(RuntimeError, match="call learn\\(\\) of the Team"):
-        team.agents["agent_0"].learn(8, reset_num_timesteps=False)
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_an_algorithm_that_resets_is_refused():
-    class Resets(PPO):
-        env: Any
-
-        def train(self):
-            self.env.reset()
-
-    team = Team(Resets, "MlpPolicy", make_team_env(ToyEnv), seed=0, **PPO_KWARGS)
-    with pytest.raises(RuntimeError, match="'agent_0' is reset only together with the others'"):
-        team.learn(64)
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_an_agent_that_will_not_stop():
-    """An agent that goes on acting when it is stopped is told so, and the first error is the one that is raised."""
-
-    class Clings(PPO):
-        def collect_rollouts(self, env, *args, **kwargs):
-            try:
-                return super().collect_rollouts(env, *args, **kwargs)
-            finally:
-                env.step(np.zeros(2, int))
-
-    env = make_team_env(ToyEnv, n_envs=2)
-    classes = {"agent_0": PPO, "agent_1": Clings}
-    team = Team(classes, "MlpPolicy", env, seed=0, **PPO_KWARGS)
-    with pytest.raises(ZeroDivisionError) as caught:
-        team.learn(64, agent_callbacks={"agent_0": Raises(3, ZeroDivisionError())})
-    if sys.version_info >= (3, 11):
-        assert "'agent_1', stopped because of this, raised RuntimeError" in notes(caught.value)
+@pytest.mark.parametrize("env", [MixedEnv, "traffic-junction-easy"])
+def test_an_environment_that_says_it_itself_is_not_overruled(env):
+    with pytest.raises(ValueError, match=r"says by its own visibility\(\) who can observe whom"):
+        make_team_env(env, visibility=looks_left)

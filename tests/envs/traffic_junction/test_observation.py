@@ -4,7 +4,7 @@ import pytest
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
-from tests.envs.scenarios import EAST, LEFT, RIGHT, STRAIGHT, TOP, gas, observe, put, quiet_core
+from tests.envs.traffic_junction.scenarios import EAST, LEFT, RIGHT, STRAIGHT, TOP, gas, observe, put, quiet_core
 
 N, R = 10, 12
 

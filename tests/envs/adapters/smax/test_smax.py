@@ -14,7 +14,7 @@ from stable_baselines3.common import evaluation
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
 from sb3_belief.envs.adapters.smax.vec_env import SmaxVecEnv
-from tests.envs.smax_helpers import (
+from tests.envs.adapters.smax.helpers import (
     OWN_FEATURES,
     PEACE,
     STOP,

@@ -12,8 +12,8 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import MaskableBeliefPPO
 from sb3_belief.envs.adapters import smaclite
-from tests.envs.fake_smaclite import SIGHT, USED, FakeSMAClite
-from tests.envs.tuple_families import make_team, train_save_load_evaluate
+from tests.envs.adapters.fake_smaclite import SIGHT, USED, FakeSMAClite
+from tests.envs.adapters.tuple_helpers import make_team, train_save_load_evaluate
 
 
 def fake(limit=60, **kwargs) -> Any:

@@ -11,7 +11,7 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters import lbf
-from tests.envs.tuple_families import check_advantages, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
 
 TWO, THREE = "Foraging-2s-8x8-2p-2f-coop-v3", "Foraging-2s-10x10-3p-3f-v3"
 NORTH, WEST, LOAD = 1, 3, 5

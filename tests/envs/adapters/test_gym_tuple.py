@@ -11,7 +11,7 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters.gym_tuple import GymTupleEnv
-from tests.envs.tuple_families import check_advantages, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
 
 BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 

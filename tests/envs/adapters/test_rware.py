@@ -10,7 +10,7 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters import rware
-from tests.envs.tuple_families import check_advantages, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
 
 TWO, FOUR = "rware-tiny-2ag-v2", "rware-tiny-4ag-v2"
 LOAD = 4

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.envs.scenarios import BOTTOM, EAST, LEFT, RIGHT, STRAIGHT, TOP, WEST, arrival, gas, put, quiet_core
+from tests.envs.traffic_junction.scenarios import BOTTOM, EAST, LEFT, RIGHT, STRAIGHT, TOP, WEST, arrival, gas, put, quiet_core
 
 ORDERS = ("commnet", "ic3net")
 

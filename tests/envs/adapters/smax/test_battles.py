@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-from tests.envs.smax_helpers import (
+from tests.envs.adapters.smax.helpers import (
     PEACE,
     STOP,
     UNIT_FEATURES,

@@ -6,7 +6,7 @@ import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from sb3_belief.envs import TrafficJunction
-from tests.envs.scenarios import EAST, STRAIGHT, TOP, put
+from tests.envs.traffic_junction.scenarios import EAST, STRAIGHT, TOP, put
 
 LEVELS = ("easy", "medium", "hard")
 

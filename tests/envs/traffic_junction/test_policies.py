@@ -9,7 +9,7 @@ from sb3_belief.envs.traffic_junction.policies import (
     evaluate_junction_policy,
     success_rate,
 )
-from tests.envs.scenarios import BOTTOM, EAST, LEFT, RIGHT, STRAIGHT, TOP, WEST, observe, put, quiet_core
+from tests.envs.traffic_junction.scenarios import BOTTOM, EAST, LEFT, RIGHT, STRAIGHT, TOP, WEST, observe, put, quiet_core
 
 EPISODES = 2048
 

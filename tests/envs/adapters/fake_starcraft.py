@@ -370,7 +370,7 @@ def installed() -> Iterator[Faults]:
 
     :return: what goes wrong from now on
     """
-    from tests.envs.fake_smacv2 import StarCraftCapabilityEnvWrapper
+    from tests.envs.adapters.fake_smacv2 import StarCraftCapabilityEnvWrapper
 
     global FAULTS
     FAULTS = Faults()

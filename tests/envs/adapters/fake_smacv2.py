@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tests.envs import fake_starcraft
-from tests.envs.fake_starcraft import GENERATED, MAPS, SIGHT, CannotResetException, StarCraft2Env, Unit
+from tests.envs.adapters import fake_starcraft
+from tests.envs.adapters.fake_starcraft import GENERATED, MAPS, SIGHT, CannotResetException, StarCraft2Env, Unit
 
 
 class StarCraft2EnvV2(StarCraft2Env):

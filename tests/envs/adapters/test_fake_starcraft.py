@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from tests.envs import fake_smacv2, fake_starcraft
+from tests.envs.adapters import fake_smacv2, fake_starcraft
 
 
 def parameters(function):

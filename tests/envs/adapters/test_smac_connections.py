@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.envs import fake_starcraft
-from tests.envs.smac_helpers import MAKERS, hide, make, make_team_env, near_the_limit, random_play, still
+from tests.envs.adapters import fake_starcraft
+from tests.envs.adapters.smac_helpers import MAKERS, hide, make, make_team_env, near_the_limit, random_play, still
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from sb3_belief.envs import TrafficJunction
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
-from tests.envs.scenarios import EAST, STRAIGHT, TOP, put
+from tests.envs.traffic_junction.scenarios import EAST, STRAIGHT, TOP, put
 
 
 def test_missing_pygame_names_the_extra(monkeypatch):
