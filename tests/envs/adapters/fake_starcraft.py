@@ -4,11 +4,8 @@ SMACv2 at 577ab5a; ``test_fake_starcraft.py`` compares the signatures with the r
 """
 
 import math
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -361,40 +358,3 @@ class StarCraft2Env:
     def close(self):
         if self._sc2_proc:
             self._sc2_proc.closed = True
-
-
-@contextmanager
-def installed() -> Iterator[Faults]:
-    """
-    Put the fakes where the real packages would be.
-
-    :return: what goes wrong from now on
-    """
-    from tests.envs.adapters.fake_smacv2 import StarCraftCapabilityEnvWrapper
-
-    global FAULTS
-    FAULTS = Faults()
-    contents: dict[str, dict[str, Any]] = {
-        "smac": {},
-        "smac.env": {"StarCraft2Env": StarCraft2Env},
-        "smac.env.starcraft2": {},
-        "smac.env.starcraft2.maps": {},
-        "smac.env.starcraft2.maps.smac_maps": {"get_smac_map_registry": lambda: MAPS},
-        "smacv2": {},
-        "smacv2.env": {},
-        "smacv2.env.starcraft2": {},
-        "smacv2.env.starcraft2.wrapper": {"StarCraftCapabilityEnvWrapper": StarCraftCapabilityEnvWrapper},
-    }
-    before = {name: sys.modules.get(name) for name in contents}
-    for name, members in contents.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        sys.modules[name] = module
-    try:
-        yield FAULTS
-    finally:
-        for name, module_before in before.items():
-            if module_before is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module_before

@@ -15,17 +15,10 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, team
 from sb3_belief.envs.adapters import smacv2
-from tests.envs.adapters import fake_starcraft
 from tests.envs.adapters.smac_helpers import MAKERS, hide, make, make_team_env, make_v2, near_the_limit, random_play, still
 from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
 
 Team: Any = team.Team
-
-
-@pytest.fixture
-def faults():
-    with fake_starcraft.installed() as installed:
-        yield installed
 
 
 @pytest.mark.parametrize("maker", MAKERS)

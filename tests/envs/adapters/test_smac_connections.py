@@ -5,14 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from tests.envs.adapters import fake_starcraft
 from tests.envs.adapters.smac_helpers import MAKERS, hide, make, make_team_env, near_the_limit, random_play, still
-
-
-@pytest.fixture
-def faults():
-    with fake_starcraft.installed() as installed:
-        yield installed
 
 
 @pytest.mark.parametrize("maker", MAKERS)

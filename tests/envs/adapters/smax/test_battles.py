@@ -37,14 +37,6 @@ def in_sight(units, n_agents):
     return np.array(rows)
 
 
-@pytest.fixture(scope="module")
-def mixed():
-    """
-    :return: four battles of 2s3z, made once for all tests that do not change them for good
-    """
-    return make_batched("2s3z", 4)
-
-
 @pytest.mark.parametrize("map_name", ["2s3z", "3s5z"])
 def test_visibility_equals_an_independent_computation(map_name):
     env = make_batched(map_name, 4)

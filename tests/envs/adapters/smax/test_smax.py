@@ -48,14 +48,6 @@ def test_the_package_is_imported_silently_and_only_when_needed():
     assert "ubmodule" not in done.stderr
 
 
-@pytest.fixture(scope="module")
-def mixed():
-    """
-    :return: four battles of 2s3z, made once for all tests that do not change them for good
-    """
-    return make_batched("2s3z", 4)
-
-
 def test_a_batch_equals_single_copies_under_the_general_vectoriser(mixed):
     single = make("2s3z")
     mixed.seed(7)
