@@ -1,4 +1,4 @@
-"""What the adapter uses of SMAClite's ``SMACliteEnv``, with its faults and without its simulation."""
+"""A fake of SMAClite's ``SMACliteEnv``: what the adapter uses, with the package's faults, without its simulation."""
 
 from types import SimpleNamespace
 
@@ -7,25 +7,27 @@ import numpy as np
 from gymnasium import spaces
 
 SIGHT, TARGET_RANGE = 9, 6
-#: what the adapter reads, besides Gymnasium's interface; a test compares it with the package where that is installed
+# Members beyond Gymnasium's interface that the adapter reads. A test compares their types with those of the package
 USED = ("n_agents", "n_enemies", "agents", "enemies", "enemy_feat_size", "ally_feat_size", "get_avail_actions")
 
 
 class FakeSMAClite(gym.Env):
     """
-    Units on a line. The first one is a healer, with fewer actions than the rows of ``get_avail_actions()`` have entries. As
-    the package does, it
+    Battle of units on a line, with the peculiarities of the package.
 
-    - takes plain Python integers only, from the dead nothing but 0, and refuses actions that are not available,
-    - has no time limit, and reports an end as a termination,
-    - gives one reward to all, and zeros as the observation of the dead,
-    - opens windows by default.
+    The first unit is a healer, which has fewer actions than the rows of ``get_avail_actions()`` have entries. Like the
+    package, the fake
 
-    :param n_agents: number of units in the team
-    :param n_enemies: of its opponents
-    :param deadly: probability that a unit dies in a step, times the number of enemies
-    :param render_mode: as the package's
-    :param use_cpp_rvo2: as the package's
+    - takes plain Python integers only, takes nothing but 0 from dead units, and refuses actions that are not available,
+    - has no time limit, and reports every end as a termination,
+    - gives the same reward to all units, and zeros as the observation of a dead one,
+    - opens a window by default.
+
+    :param n_agents: Number of units in the team
+    :param n_enemies: Number of enemies
+    :param deadly: Probability that a unit dies in a step, per enemy that is alive
+    :param render_mode: The package's argument
+    :param use_cpp_rvo2: The package's argument
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 60}  # noqa: RUF012

@@ -1,4 +1,4 @@
-"""A fake of SMACv2: that of SMAC with units, positions and sight of its own, behind the wrapper of the real package."""
+"""A fake of SMACv2: the fake of SMAC with other units, positions and sight, behind a wrapper like that of the real package."""
 
 import math
 import random
@@ -12,7 +12,7 @@ from tests.envs.adapters.fake_starcraft import GENERATED, MAPS, SIGHT, CannotRes
 
 
 class StarCraft2EnvV2(StarCraft2Env):
-    """SMACv2's, as far as it differs."""
+    """A fake of SMACv2's ``StarCraft2Env``, which overrides what differs from SMAC."""
 
     maps: ClassVar = {**MAPS, **GENERATED}
 
@@ -97,7 +97,7 @@ class StarCraft2EnvV2(StarCraft2Env):
 
 
 class TeamDistribution:
-    """As SMACv2's: from a generator without a seed, and shuffled by the process's."""
+    """Units drawn, as in SMACv2, from a generator without a seed and shuffled by the process's own generator."""
 
     def __init__(self, config: dict[str, Any]):
         self.config, self.rng = config, np.random.default_rng()
@@ -110,7 +110,7 @@ class TeamDistribution:
 
 
 class UniformDistribution:
-    """Positions; it lies inside of another, as in SMACv2."""
+    """Uniform positions. As in SMACv2, another distribution holds this one."""
 
     def __init__(self, config: dict[str, Any]):
         self.config, self.rng = config, np.random.default_rng()
@@ -120,7 +120,7 @@ class UniformDistribution:
 
 
 class PositionDistribution:
-    """It has no generator of its own."""
+    """Start positions drawn by an inner distribution. It has no generator of its own."""
 
     def __init__(self, config: dict[str, Any]):
         self.inner = UniformDistribution(config)
@@ -130,7 +130,7 @@ class PositionDistribution:
 
 
 class StarCraftCapabilityEnvWrapper:
-    """SMACv2's."""
+    """A fake of SMACv2's wrapper, which draws units and positions and resets the environment with them."""
 
     def __init__(self, **kwargs):
         self.distribution_config = kwargs["capability_config"]
@@ -139,7 +139,7 @@ class StarCraftCapabilityEnvWrapper:
         for key, config in self.distribution_config.items():
             if key in ("n_units", "n_enemies"):
                 continue
-            # The caller's own dictionary is written into
+            # As in SMACv2, this writes into the caller's own dictionary
             assert "env_key" not in config, "used twice"
             config |= {"env_key": key, **{n: self.distribution_config[n] for n in ("n_units", "n_enemies")}}
             self.env_key_to_distribution_map[key] = kinds[config["dist_type"]](config)

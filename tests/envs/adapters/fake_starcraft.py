@@ -1,6 +1,8 @@
 """
-SMAC and SMACv2 without StarCraft II: the same classes, methods and faults around a small battle, as of SMAC at d6aab33 and
-SMACv2 at 577ab5a; ``test_fake_starcraft.py`` compares the signatures with the real packages where these are installed.
+A fake of SMAC that needs no StarCraft II: the same class, methods and faults around a small battle, as in SMAC at d6aab33.
+
+``fake_smacv2.py`` holds what SMACv2 (at 577ab5a) adds. ``test_fake_starcraft.py`` compares the signatures with those of the
+real packages where these are installed.
 """
 
 import math
@@ -24,16 +26,16 @@ MOVES = {2: (0, 2), 3: (0, -2), 4: (2, 0), 5: (-2, 0)}
 
 
 class ConnectionLost(Exception):
-    """What pysc2 raises inside the packages."""
+    """Error that pysc2 raises inside the packages."""
 
 
 class CannotResetException(Exception):
-    """SMACv2's, when units do not appear."""
+    """Error that SMACv2 raises when units do not appear."""
 
 
 @dataclass
 class Process:
-    """One StarCraft II."""
+    """One StarCraft II process."""
 
     seed: int | None
     closed: bool = False
@@ -42,11 +44,15 @@ class Process:
 @dataclass
 class Faults:
     """
-    What goes wrong, and what was seen.
+    Faults that the fakes make, and a record of what they were asked.
 
-    :param lost_steps: at which of all steps the connection is lost
-    :param lost_resets: how many resets lose it from now on
-    :param missing_units: how many resets of SMACv2 fail for want of units from now on
+    :param lost_steps: Numbers of the steps, counted over all battles from 1, at which the connection is lost
+    :param lost_resets: Number of resets from now on at which the connection is lost
+    :param missing_units: Number of resets of SMACv2 from now on that fail because units do not appear
+    :param processes: All processes that were launched
+    :param sent: Available actions of all units and the actions that they were sent, for each step
+    :param n_steps: Number of steps so far
+    :param obs_calls: Number of calls of ``get_obs`` so far
     """
 
     lost_steps: set[int] = field(default_factory=set)
@@ -58,9 +64,7 @@ class Faults:
     obs_calls: int = 0
 
     def running(self) -> list[Process]:
-        """
-        :return: the StarCraft II that nobody has closed
-        """
+        """Return the processes that have not been closed."""
         return [process for process in self.processes if not process.closed]
 
 
@@ -69,7 +73,7 @@ FAULTS = Faults()
 
 @dataclass
 class Unit:
-    """One unit."""
+    """One unit of a battle."""
 
     pos: SimpleNamespace
     kind: str
@@ -78,7 +82,7 @@ class Unit:
 
 
 class StarCraft2Env:
-    """SMAC's."""
+    """A fake of SMAC's ``StarCraft2Env``, with its arguments."""
 
     maps: ClassVar = MAPS
 
@@ -156,7 +160,7 @@ class StarCraft2Env:
             self._restart()
         self.last_action = np.zeros((self.n_agents, self.n_actions))
         if FAULTS.lost_resets:
-            # The units are those of the battle before, or none
+            # As in SMAC, the units remain those of the previous battle, or there are none
             FAULTS.lost_resets -= 1
             self.full_restart()
         else:
@@ -237,7 +241,7 @@ class StarCraft2Env:
     def _distance(a: Unit, b: Unit) -> float:
         return math.hypot(a.pos.x - b.pos.x, a.pos.y - b.pos.y)
 
-    # What can be asked
+    # Queries
 
     def unit_shoot_range(self, agent_id):
         return 6
@@ -276,7 +280,7 @@ class StarCraft2Env:
         return self.n_agents - 1, 5 + self.unit_type_bits + self.obs_last_action * self.n_actions
 
     def get_obs_own_feats_size(self):
-        # The time step is counted here and appended besides
+        # As in SMAC, the time step is counted here although it is appended separately
         return 1 + self.unit_type_bits + self.obs_timestep_number
 
     def get_obs_size(self):
@@ -327,7 +331,7 @@ class StarCraft2Env:
             for e_id, enemy in self.enemies.items():
                 near = self._distance(unit, enemy) < sight
                 arr[i, self.n_agents + e_id] = unit.health > 0 and enemy.health > 0 and near
-            # Filled symmetrically with the sight range of the first of the two
+            # As in SMAC, both entries of a pair use the sight range of its first unit
             for j in range(i + 1, self.n_agents):
                 other = self.agents[j]
                 near = self._distance(unit, other) < sight

@@ -1,4 +1,4 @@
-"""The fakes of SMAC and SMACv2 have the interfaces of the real packages."""
+"""The fakes of SMAC and SMACv2 have the same interfaces as the real packages."""
 
 import inspect
 from importlib.util import find_spec

@@ -1,4 +1,4 @@
-"""Gymnasium tuple environments as PettingZoo ones: what is passed on, what is refused, how an episode ends."""
+"""Gymnasium environments with Tuple spaces as PettingZoo ones: what is passed on, what is refused, and how episodes end."""
 
 from typing import Any
 
@@ -18,10 +18,12 @@ BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
 class Toy(gym.Env):
     """
-    Two agents who see how many steps have passed and a random number of the episode, as plain lists.
+    Environment of two agents that observe, as plain lists, the number of steps so far and a random number of the episode.
 
-    :param ends_at: step of each episode, in turn, at which it reports its end
-    :param reward: what it returns as reward
+    :param ends_at: Steps at which the episodes terminate, used in turn
+    :param reward: What ``step`` returns as reward
+    :param actions: Action spaces of the two agents. None for Discrete ones
+    :param render_mode: Gymnasium's argument
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -58,7 +60,7 @@ class Toy(gym.Env):
 
 
 class Full(GymTupleEnv):
-    """With all that a subclass can say: the second agent is in play at even times only, an end at step 3 is a limit."""
+    """Adapter that overrides every hook: the second agent is active at even times only, and an end at step 3 is a limit."""
 
     def _visible(self, observations):
         return np.array([[observations[0][0] == 2], [False]])
@@ -77,7 +79,7 @@ class Full(GymTupleEnv):
 
 
 def play(env, n_steps=100, seed=0, actions=(0, 0)):
-    """One episode, at most that many steps of it: all that ``step`` returned."""
+    """Play at most ``n_steps`` steps of one episode, and return what ``step`` returned at each of them."""
     env.reset(seed=seed)
     steps: list[Any] = []
     while env.agents and len(steps) < n_steps:
@@ -94,7 +96,7 @@ def test_spaces_and_observations():
     assert env.possible_agents == ["agent_0", "agent_1"] and env.metadata["name"] == "toy"
     assert [env.action_space(agent) for agent in env.possible_agents] == [spaces.Discrete(3), spaces.Discrete(2)]
     assert env.observation_space("agent_0") == BOX
-    # the package's one object became two, so that seeding one does not seed the other
+    # The two agents share one space object in the package. The copies keep one from being seeded with the other
     assert env.observation_space("agent_0") is not env.observation_space("agent_1")
     first, infos = env.reset(seed=3, options={"level": 1})
     assert infos == {"agent_0": {}, "agent_1": {}} and env.game.options == {"level": 1}
@@ -121,10 +123,14 @@ def test_rewards(reward, own):
     [
         (GymTupleEnv(Toy()), 5, True),
         (GymTupleEnv(Toy(), max_episode_steps=4), 4, False),
-        (GymTupleEnv(Toy(), max_episode_steps=5), 5, True),  # the last step ends it as well: there is nothing to bootstrap
+        (
+            GymTupleEnv(Toy(), max_episode_steps=5),
+            5,
+            True,
+        ),  # The last step terminates too: there is nothing to bootstrap
         (GymTupleEnv(TimeLimit(Toy(), 2)), 2, False),
         (GymTupleEnv(TimeLimit(Toy(), 5)), 5, True),
-        (Full(Toy((3,))), 3, False),  # reported as a termination
+        (Full(Toy((3,))), 3, False),  # The environment itself reports a termination
         (Full(Toy((4,))), 4, True),
     ],
 )
@@ -148,7 +154,7 @@ def test_what_a_subclass_says():
         seen.append([row.tolist() for row in env.visibility().values()])
     assert seen == [[[False], [False]], [[True], [False]], [[False], [False]], [[False], [False]]]
     first, second = ([step[4][agent] for step in steps] for agent in env.possible_agents)
-    # whether it was in play when it acted, not now
+    # "active" says whether the agent was in play when it acted, not whether it is now
     assert [info.get("active", True) for info in second] == [True, False, True, False]
     assert all(info.get("active", True) for info in first)
     assert [info.get("is_success") for info in second] == [None, None, None, True]
@@ -231,7 +237,7 @@ def test_a_team_of_them():
 
 
 def test_advantages_over_terminations_and_limits():
-    # Episodes of 3 steps terminate, those of 5 are cut at 4
+    # Episodes of 3 steps terminate, those of 5 are truncated at step 4
     ends = check_advantages(lambda: GymTupleEnv(Toy((3, 5)), max_episode_steps=4), lambda obs: bool(obs[0] == 3), n_steps=16)
     assert set(ends) == {True, False}
 

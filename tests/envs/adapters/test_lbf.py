@@ -1,4 +1,4 @@
-"""Level-Based Foraging: who is seen, how episodes end, that seeds are kept to."""
+"""Level-Based Foraging: which agent sees which, how episodes end, and reproducibility by seed."""
 
 import copy
 import pickle
@@ -18,11 +18,12 @@ NORTH, WEST, LOAD = 1, 3, 5
 
 
 def act(env, *actions):
+    """Step with the agents' actions in their order."""
     return env.step(dict(zip(env.possible_agents, actions, strict=True)))
 
 
 def placed(name, *players, food=((6, 6, 4),), **env_kwargs):
-    """An episode with players of level 1 and food (row, column, level) put where a test wants them."""
+    """Return an environment whose players, of level 1, and whose food (row, column, level) stand where a test wants them."""
     env: Any = lbf.make(name, **env_kwargs)
     env.reset(seed=0)
     env.game.field[:] = 0
@@ -37,9 +38,10 @@ def placed(name, *players, food=((6, 6, 4),), **env_kwargs):
 
 def in_the_observation(env, obs):
     """
-    Read from the observations: each block [row, column, level] of a player that is seen is counted from the corner of the
-    viewer's window. Whoever stands there is in view (two may: the package lets a player into a cell that another fails to
-    leave).
+    Read from the observations which agent sees which other.
+
+    Each visible player has a block [row, column, level], counted from the corner of the viewer's window. All players at that
+    position are in view. There can be two, because the package lets a player into a cell that another fails to leave.
     """
     game = env.game
     stands: dict[Any, list[int]] = {}
@@ -76,12 +78,12 @@ def test_who_is_seen_is_who_is_in_the_observation(name):
 @pytest.mark.parametrize(
     ("first", "second", "seen"),
     [
-        ((0, 0), (4, 4), [True, False]),  # from the upper left corner one sees four cells far, the other sees two
+        ((0, 0), (4, 4), [True, False]),  # A player in the upper left corner sees four cells far, the other one two
         ((0, 0), (5, 4), [False, False]),
         ((1, 1), (4, 1), [True, False]),
         ((3, 3), (5, 5), [True, True]),
         ((3, 3), (6, 3), [False, False]),
-        ((7, 7), (5, 5), [True, True]),  # the lower right corner is like the middle
+        ((7, 7), (5, 5), [True, True]),  # In the lower right corner sight is as in the middle
         ((7, 7), (4, 7), [False, False]),
         ((7, 0), (7, 4), [True, False]),
         ((0, 7), (4, 7), [True, False]),
@@ -91,7 +93,7 @@ def test_who_is_seen_at_the_borders(first, second, seen):
     env = placed(TWO, first, second, food=((6, 2, 4),))
     obs, *_ = act(env, 0, 0)
     assert [row.tolist() for row in env.visibility().values()] == [[flag] for flag in seen]
-    # the level in the block after one's own
+    # The level in the block that follows the agent's own
     assert [bool(own[6 + 3 + 2] > 0) for own in obs.values()] == seen
 
 
@@ -104,7 +106,7 @@ def test_packed_blocks_are_not_taken_for_agents():
 
 
 def test_a_seed_gives_the_same_episode_whatever_was_before():
-    """Left to itself, the package avoids the cells in which players stood last."""
+    """Without the adapter the package would avoid the cells in which players stood last."""
     used = lbf.make(TWO)
     for seed in [*range(40), 39, 39]:
         first, fresh = used.reset(seed=seed)[0], lbf.make(TWO).reset(seed=seed)[0]
@@ -120,7 +122,7 @@ def test_pettingzoo_s_own_test():
 @pytest.mark.parametrize(("limit", "steps", "success"), [(50, 2, True), (2, 2, True), (1, 1, False)])
 def test_the_limit_truncates_only_where_food_is_left(limit, steps, success):
     env = placed(TWO, (2, 1), (2, 3), food=((2, 2, 2),), max_episode_steps=limit)
-    assert act(env, LOAD, 0)[1] == {"agent_0": 0.0, "agent_1": 0.0}  # not alone
+    assert act(env, LOAD, 0)[1] == {"agent_0": 0.0, "agent_1": 0.0}  # One player alone cannot load this food
     if steps == 1:
         env = placed(TWO, (2, 1), (2, 3), food=((2, 2, 2),), max_episode_steps=limit)
     _, rewards, terminations, truncations, infos = act(env, LOAD, LOAD if success else 0)
@@ -137,10 +139,10 @@ def test_random_episodes_end_at_50_or_with_the_last_food():
         _, _, dones, infos = env.step({agent: rng.integers(6, size=4) for agent in env.possible_agents})
         ends += [info for info, done in zip(infos, dones, strict=True) if done]
     for info in ends:
-        collected = info["terminal_observation"]["agent_0"][2] == 0  # sight is unlimited: the food's level
+        collected = info["terminal_observation"]["agent_0"][2] == 0  # The food's level, which is seen from everywhere
         assert info["is_success"] == collected and info["TimeLimit.truncated"] == (not collected)
         assert info["truncated"].tolist() == [not collected] * 2 and info["life_end"].tolist() == [collected] * 2
-        # the team's return is the part of the food that was collected
+        # The team's return is the collected share of the food
         assert info["episode"]["r"] == pytest.approx(float(collected), abs=1e-5)
         assert collected or info["episode"]["l"] == 50
     assert {info["is_success"] for info in ends} == {True, False}
@@ -159,7 +161,7 @@ def test_state(carry):
     act(env, 0, 1, 2)
     state = carry(env.get_state())
     other.set_state(state)
-    state["game"]["field"][:] = 99  # what it was given is its own
+    state["game"]["field"][:] = 99  # The environment has copied the state that it was given
     assert other.agents and np.array_equal(list(other.visibility().values()), list(env.visibility().values()))
     for _ in range(20):
         if not env.agents:

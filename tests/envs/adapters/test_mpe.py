@@ -1,4 +1,4 @@
-"""mpe/<name>: a radius of sight hides teammates from observations and from what an agent is told of their actions."""
+"""``mpe/<name>``: a radius of sight hides teammates from the observations, and their actions from the agents' infos."""
 
 from importlib import import_module
 from typing import Any
@@ -21,9 +21,12 @@ def random_actions(env, rng):
 
 def seen_alone(env, viewer):
     """
-    The observation of a viewer in a world in which all whom it cannot see stand where it stands, at rest and silent.
+    Compute what a viewer observes if every agent beyond the radius stands at the viewer's place, at rest and silent.
 
-    It knows nothing of where an observation shows whom: relative positions, velocities and messages become zero by themselves.
+    The relative positions, velocities and messages of those agents then are zero, so this needs no knowledge of where an
+    observation shows which agent.
+
+    :return: The observation, and for each other agent whether it is within the radius
     """
     world = env.unwrapped.world
     me = world.agents[viewer]
@@ -57,7 +60,7 @@ def test_a_radius_blanks_exactly_who_is_beyond_it(name):
                 flags += who
             if not env.agents:
                 break
-            # the last of these is the terminal observation, with the world as it was then
+            # The last one is the terminal observation, with the world as it was at the end of the episode
             obs, *_ = env.step(random_actions(env, rng))
     assert any(flags) and not all(flags)
 
@@ -159,7 +162,7 @@ def test_a_team_is_told_of_those_within_the_radius_only(vec_env):
         obs, *_ = alone.step({agent: int(actions[agent][1]) for agent in alone.agents})
         assert infos[1]["visible"].tolist() == [row.tolist() for row in alone.visibility().values()]
         assert dones.tolist() == [t == 9] * 2
-    # the limit is no end of the task, and the last observation is the one that was cut off, blanked too
+    # The limit truncates, and the terminal observation hides teammates too
     assert infos[1]["TimeLimit.truncated"] is True and infos[1]["truncated"].all()
     for agent, value in infos[1]["terminal_observation"].items():
         np.testing.assert_array_equal(value, obs[agent])
@@ -168,7 +171,7 @@ def test_a_team_is_told_of_those_within_the_radius_only(vec_env):
 
 def test_visibility_survives_wrappers():
     def wrap(env):
-        # the second one converts to AEC and back
+        # dtype_v0 converts the environment to AEC and back
         return supersuit.dtype_v0(supersuit.frame_stack_v1(env, 2), np.float64)
 
     kwargs = {"radius": 1.2}

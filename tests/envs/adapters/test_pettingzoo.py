@@ -1,4 +1,4 @@
-"""pettingzoo/<module> and to_parallel(): conversions, masks, turns, agents that die, the window of pursuit."""
+"""``pettingzoo/<module>`` and ``to_parallel()``: conversions, masks, turns, agents that die, and the window of pursuit."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ PURSUIT, KNIGHTS, TICTACTOE, RPS = map(newest, ("sisl.pursuit", "butterfly.knigh
 
 
 class MaskedObservations(ToyEnv):
-    """PettingZoo's convention of masks within observations; the last agent has none."""
+    """A ``ToyEnv`` with masks within its observations, as is PettingZoo's convention. The last agent has none."""
 
     def observation_space(self, agent):
         space = super().observation_space(agent)
@@ -33,7 +33,7 @@ class MaskedObservations(ToyEnv):
     def observations(self):
         plain = super().observations()
         for i, agent in enumerate(self.agents[:-1]):
-            # at every third step nothing is allowed
+            # For one value of t + i in four no action is allowed
             mask = np.arange(3) == (self.t + i) if (self.t + i) % 4 < 3 else np.zeros(3)
             plain[agent] = {"observation": plain[agent], "action_mask": mask.astype(np.int8)}
         return plain
@@ -46,7 +46,7 @@ def test_masks_move_from_observations_to_infos():
     env: Any = to_parallel(MaskedObservations(3))
     assert isinstance(env, SplitMasks) and env.unwrapped is env
     assert env.observation_space("agent_0") == ToyEnv(3).observation_space("agent_0")
-    assert env.limit == 7  # the wrapped environment's own
+    assert env.limit == 7  # An attribute of the wrapped environment
     (obs, _), (plain, _) = env.reset(seed=1), ToyEnv(3).reset(seed=1)
     assert all((obs[agent] == plain[agent]).all() for agent in plain)
     masks = []
@@ -54,7 +54,7 @@ def test_masks_move_from_observations_to_infos():
         *_, infos = env.step(dict.fromkeys(env.agents, 1))
         masks.append([infos[agent].get("action_mask", np.array([])).tolist() for agent in env.possible_agents])
     first, second, third = np.eye(3, dtype=bool).tolist()
-    # rows: steps 1 to 3; where nothing was allowed action 0 is
+    # Rows are steps 1 to 3. Where a mask allowed nothing, it now allows action 0
     assert masks == [[second, third, []], [third, first, []], [first, first, []]]
     assert [row.tolist() for row in env.visibility().values()] == [[False, False]] * 3
 
@@ -95,13 +95,13 @@ def test_in_a_game_of_turns_only_the_one_on_turn_acts():
     obs, infos = env.reset(seed=0)
     assert env.observation_space("player_1") == spaces.Box(0, 1, (3, 3, 2), np.int8)
     assert infos["player_1"]["action_mask"].all()
-    # a model must choose something: action 0, which is ignored
+    # A model must choose some action, so the mask allows action 0, which is ignored
     assert infos["player_2"]["action_mask"].tolist() == [True] + [False] * 8
     assert not any(row.any() for row in env.visibility().values())
     for t, cell in enumerate([0, 3, 1, 4, 2]):
         mover = f"player_{t % 2 + 1}"
         obs, rewards, terminations, truncations, infos = env.step({"player_1": cell, "player_2": cell})
-        # who was on turn is seen to act, who waited is not
+        # The player on turn is seen to act, the one that waits is not
         assert {agent: row.tolist() for agent, row in env.visibility().items()} == {
             "player_1": [mover == "player_2"],
             "player_2": [mover == "player_1"],
@@ -119,7 +119,7 @@ def test_a_team_plays_a_game_of_turns_by_its_masks():
     lengths = []
     for _ in range(200):
         masks = env.action_masks()
-        # an illegal move would end the game with a penalty for the mover only
+        # An illegal move would end the game with a penalty for that player only
         actions = {agent: np.array([rng.choice(np.flatnonzero(row)) for row in masks[agent]]) for agent in masks}
         _, _, dones, infos = env.step(actions)
         for i in np.flatnonzero(dones):
@@ -138,10 +138,10 @@ def test_a_pursuer_sees_who_is_in_its_window():
         obs, *_ = env.step({agent: int(rng.integers(5)) for agent in env.agents})
         visible = env.visibility()
         for agent in env.possible_agents:
-            # the second channel counts the pursuers in each cell of the window, itself in the middle
+            # The second channel counts the pursuers in each cell of the window, which includes the viewer in the middle
             window = obs[agent][..., 1]
             n_seen += visible[agent].sum()
-            # observations are taken when all have moved, as visibility is
+            # Observations and visibility are both taken after all have moved
             assert visible[agent].sum() == window.sum() - 1
     assert 0 < n_seen
 
@@ -172,7 +172,7 @@ def test_they_keep_the_contract(env_id):
 def test_unknown_names_and_missing_parts():
     with pytest.raises(ValueError, match=r"no 'sisl.persuit_v5'. Did you mean 'sisl.pursuit"):
         make_parallel_env("pettingzoo/sisl.persuit_v5")
-    # a module of PettingZoo that is no environment is not imported
+    # A module of PettingZoo that is not an environment is not imported
     with pytest.raises(ValueError, match=r"no 'test.api_test'"):
         make_parallel_env("pettingzoo/test.api_test")
 

@@ -1,4 +1,4 @@
-"""The Multi-Robot Warehouse: who is seen, how episodes end, that seeds are kept to."""
+"""The Multi-Robot Warehouse: which robot sees which, how episodes end, and reproducibility by seed."""
 
 import pickle
 from functools import partial
@@ -17,13 +17,16 @@ LOAD = 4
 
 
 def act(env, *actions):
+    """Step with the agents' actions in their order."""
     return env.step(dict(zip(env.possible_agents, actions, strict=True)))
 
 
 def in_the_observation(env, obs):
     """
-    Read from the observations: after 8 numbers of one's own, one block for each cell of the window, row by row, which begins
-    with a 1 where a robot is. Whoever stands there is in view.
+    Read from the observations which robot sees which other.
+
+    After 8 numbers of the robot's own, an observation has one block for each cell of the window, row by row. A block begins
+    with a 1 where a robot stands.
     """
     game, reach = env.game, env.game.sensor_range
     stands = {(robot.x, robot.y): j for j, robot in enumerate(game.agents)}
@@ -80,7 +83,7 @@ def test_every_end_is_a_truncation(env_kwargs, length):
     for t in range(1, length + 1):
         _, _, terminations, truncations, infos = act(env, 0, 0)
         assert set(terminations.values()) == {False} and set(truncations.values()) == {t == length}
-        assert not any(infos.values())  # there is no success, there are no masks and all are in play
+        assert not any(infos.values())  # There is no success, there are no masks, and all agents are in play
     assert not env.agents
 
 
@@ -134,7 +137,7 @@ def test_observations_and_arguments():
     image = rware.make(TWO, observation_type="image", sensor_range=2)
     obs, _ = image.reset(seed=0)
     assert obs["agent_0"].shape == (5, 5, 5) and image.observation_space("agent_0").contains(obs["agent_0"])
-    # directional images are turned views of one array, which must not be handed on
+    # The package's directional images are rotated views of one array, so the adapter must return copies
     first = obs["agent_1"].copy()
     act(image, 2, 2)
     assert np.array_equal(first, obs["agent_1"])

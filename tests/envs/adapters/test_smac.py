@@ -1,7 +1,4 @@
-"""
-SMAC and SMACv2 against fakes with the same interface and the same faults. The last tests compare the fakes with the real
-packages, where these are installed.
-"""
+"""The adapters to SMAC and SMACv2, tested against fakes that have the packages' interfaces and faults."""
 
 import copy
 import random
@@ -26,7 +23,7 @@ def test_pettingzoo_interface(faults, maker):
     env = maker()
     assert not faults.processes, "StarCraft starts when it is needed"
     with warnings.catch_warnings():
-        # It samples actions without masks, and this environment refuses what is impossible
+        # PettingZoo's test samples actions without masks, and this environment refuses illegal ones
         warnings.simplefilter("ignore")
         with pytest.raises(ValueError, match="cannot do action"):
             parallel_api_test(env, num_cycles=30)
@@ -47,7 +44,7 @@ def test_no_illegal_action_is_sent_in_10000_steps(faults, maker):
     env.reset(seed=0)
     ends = 0
     for _ in range(10_000):
-        # The dead choose anything: it is not sent
+        # Dead units may choose any action, because it is not sent to the game
         dead = {a: int(generator.integers(env.n_actions)) for i, a in enumerate(env.possible_agents) if env._masks[i, 0]}
         random_play(env, generator, dead)
         if not env.agents:
@@ -94,9 +91,9 @@ def test_a_battle_that_is_over_terminates(faults, won):
     hide(env)
     for unit in (env.game.enemies if won else env.game.agents).values():
         unit.health = 0.0
-    # The masks are those of before
+    # The masks as they were before the units fell
     env._masks[:, 0] = not won
-    # Even at the step limit
+    # A battle that is over terminates even at the step limit
     near_the_limit(env, 1)
     _, rewards, terminations, truncations, infos = env.step(still(env))
     assert all(terminations.values()) and not any(truncations.values()) and not env.agents
@@ -119,7 +116,7 @@ def test_the_step_limit_truncates(faults, maker):
 
 
 def battle_of_five_steps(is_won):
-    """Nobody meets; in the fifth step either the enemies fall or the limit is reached."""
+    """Return a battle in which the sides never meet, and whose fifth step either is won or reaches the limit."""
     env = make("3m")
     reset, step, steps = env.reset, env.step, [0]
 
@@ -171,7 +168,9 @@ def test_observations_are_asked_for_once_per_step(faults, maker):
 
 def visible_from_positions(env):
     """
-    :return: who sees whom by positions, sight ranges and cones, and how often SMACv2's matrix says otherwise
+    Compute from positions, sight ranges and cones which unit sees which.
+
+    :return: Bool ``[n_agents, n_agents]``, and the number of entries in which the package's own matrix differs
     """
     game = env.game
     n_agents = len(env.possible_agents)
@@ -195,7 +194,7 @@ def visible_from_positions(env):
         (partial(make, "2s3z"), True),
         (partial(make, "2s3z", obs_last_action=True), True),
         (partial(make_v2, "zerg_10_vs_11", use_unit_ranges=False), True),
-        # Mixed sight ranges, or sight in a direction
+        # Units of different sight ranges, and units that see in one direction only
         (partial(make_v2, "zerg_10_vs_11"), False),
         (partial(make_v2, "protoss_10_vs_10", conic_fov=True), False),
     ],
@@ -207,7 +206,7 @@ def test_visibility(faults, maker, matrix_is_right):
     n_agents = len(env.possible_agents)
     hidden = differences = ends = 0
     for _ in range(400):
-        # A direction for each, so that they lose sight of each other
+        # Each unit walks in a direction of its own, so that they lose sight of each other
         apart = {a: 2 + i % 4 for i, a in enumerate(env.possible_agents) if env._masks[i, 2 + i % 4]}
         random_play(env, generator, apart if generator.random() < 0.5 else None)
         sees, wrong = visible_from_positions(env)
@@ -218,7 +217,7 @@ def test_visibility(faults, maker, matrix_is_right):
         hidden += alive * (alive - 1) - sees.sum()
         differences += wrong
         if not env.agents:
-            # Also at the last step, of which nothing is known any more after the reset
+            # The last step of an episode is covered too. Its positions are gone after the reset
             ends += sees.any() or n_agents == 3
             env.reset()
     assert hidden > 0
@@ -232,7 +231,7 @@ def test_observations(faults):
         observations, _ = env.reset(seed=3)
         for agent, space in env.observation_spaces.items():
             assert observations[agent].shape == space.shape and observations[agent].dtype == np.float32
-    # SMAC counts the time step once more than it says
+    # SMAC's observations have one entry more than get_obs_size() says, since the time step is appended as well
     assert timed.width == plain.width + 2 and timed.game.get_obs_size() == plain.width + 1
     assert told.width == plain.width + 4 * 11
     assert not plain.game.obs_last_action
@@ -256,11 +255,11 @@ def test_seeds(faults):
         np.random.seed(2)
         expected_random, expected_numpy = random.Random(2).random(), np.random.RandomState(2).random()
         np.testing.assert_array_equal(life, lives(second, 7))
-        # On a used instance too
+        # The seed also decides everything in an environment that has been used before
         np.testing.assert_array_equal(life, lives(second, 7))
         assert not np.array_equal(life[0], lives(second, 8, 0)[0])
         if maker.func is make_v2:
-            # The process's own generators are as if nothing had been drawn
+            # The process's own generators are as if nothing had been drawn from them
             assert random.random() == expected_random and np.random.random() == expected_numpy
         first.reset()
         second.reset()
@@ -330,6 +329,6 @@ def test_a_team_learns_is_saved_and_evaluated(faults, tmp_path, env_id):
     maker = partial(make, "2s3z") if env_id.startswith("smac/") else partial(make_v2, "protoss_5_vs_5")
     assert env.observation_space == make_team_env(maker).observation_space
     assert len(train_save_load_evaluate(maker, tmp_path, MaskableBeliefPPO)) == 2
-    # Without masks it chooses what the game would not take
+    # Without masks the agents choose actions that the game refuses
     with pytest.raises(ValueError, match="heeds action masks"):
         Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=64).learn(128)

@@ -1,4 +1,4 @@
-"""Lost connections to StarCraft II."""
+"""What the adapters to SMAC and SMACv2 do when the connection to StarCraft II is lost."""
 
 from functools import partial
 
@@ -24,7 +24,7 @@ def test_a_lost_connection_truncates_and_the_next_battle_begins(faults, maker, f
     with pytest.warns(UserWarning, match="lost its connection"):
         last, rewards, terminations, truncations, infos = random_play(env, generator)
     assert all(truncations.values()) and not any(terminations.values()) and not env.agents
-    # The units of the closed game are not asked, nobody says that the battle was lost, and nobody saw anything
+    # The units of the closed game are not queried, the battle does not count as lost, and no unit is reported as seen
     assert faults.obs_calls == calls
     for agent in env.possible_agents:
         np.testing.assert_array_equal(last[agent], observations[agent])
@@ -50,7 +50,7 @@ def test_a_lost_connection_under_the_vectoriser(faults):
 def test_no_starcraft_is_left_behind(faults):
     env = make("3m")
     env.reset(seed=0)
-    # SMAC would launch another one at each reset before its first battle is over
+    # SMAC itself would launch another process at each reset before its first battle is over
     for _ in range(3):
         env.step(still(env))
         env.reset()

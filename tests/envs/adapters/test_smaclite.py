@@ -1,4 +1,4 @@
-"""SMAClite: against a fake with its interface and its faults, and where the package is installed against itself."""
+"""The adapter to SMAClite, tested against a fake with its interface and faults, and where possible against the package."""
 
 import sys
 from functools import partial
@@ -26,7 +26,7 @@ def real(name="2s3z", **kwargs) -> Any:
 
 
 def play(env, rng, seed=None):
-    """An episode of random possible actions: all that ``step`` returned, and who was alive before."""
+    """Play an episode of random legal actions, and yield what ``step`` returned and which units were alive before it."""
     _, infos = env.reset(seed=seed)
     while env.agents:
         alive = set(env.game.agents)
@@ -37,7 +37,7 @@ def play(env, rng, seed=None):
 
 
 def in_sight(env):
-    """From the positions and not from the observations: both alive and at most the sight apart."""
+    """Compute from the positions which unit sees which other: both are alive and within the sight range."""
     units, n = env.game.agents, env.game.n_agents
     near = [
         [i in units and j in units and np.linalg.norm(units[i].pos - units[j].pos) <= SIGHT for j in range(n)]
@@ -54,7 +54,7 @@ def test_who_is_seen(make):
         for *_, _alive in play(env, rng, seed):
             rows = [row.tolist() for row in env.visibility().values()]
             assert rows == in_sight(env)
-            # the last step is among them, in which the fallen neither see nor are seen
+            # The last step is included. Dead units neither see nor are seen
             seen, unseen = seen + sum(map(sum, rows)), unseen + sum(map(len, rows)) - sum(map(sum, rows))
     assert seen > 100 and unseen > 100
 
@@ -66,14 +66,14 @@ def test_no_impossible_action_is_sent_in_10000_steps():
         for obs, rewards, terminations, truncations, infos, alive in play(env, rng):
             steps += 1
             for i, agent in enumerate(env.possible_agents):
-                # whether it lived when it acted
+                # Whether the unit was alive when it acted
                 assert infos[agent].get("active", True) == (i in alive)
                 mask = infos[agent]["action_mask"]
                 assert mask.dtype == bool and mask.shape == (env.action_space(agent).n,) and mask.any()
                 if i not in env.game.agents:
                     dead += 1
                     assert np.flatnonzero(mask).tolist() == [0] and not obs[agent].any()
-            assert len(set(rewards.values())) == 1  # the fallen get it as well
+            assert len(set(rewards.values())) == 1  # Dead units are given it too
             over = not env.game.enemies or not env.game.agents
             assert set(terminations.values()) == {over} and not (over and any(truncations.values()))
             if not env.agents:
@@ -106,7 +106,7 @@ def test_actions():
     while len(env.game.agents) == 4:
         env.step(dict.fromkeys(env.possible_agents, np.int64(1)))
     (dead,) = set(range(4)) - set(env.game.agents)
-    # the dead may send what they like, 0 arrives
+    # Whatever a dead unit chooses, the game is sent 0
     _, _, _, _, infos = env.step(dict.fromkeys(env.possible_agents, 1))
     assert [info["active"] for info in infos.values()] == [i != dead for i in range(4)]
     with pytest.raises(ValueError, match=r"cannot do action 0 now, possible are \[1, 2.*MaskableBeliefPPO"):
@@ -117,7 +117,7 @@ def test_actions():
 
 def test_pettingzoo_s_own_test():
     class AnyAction(smaclite.Battle):
-        """Its random actions heed no masks."""
+        """Battle that replaces all actions by a legal one, since PettingZoo's test ignores masks."""
 
         def _joint_action(self, actions):
             return super()._joint_action({agent: 1 for agent in actions})
@@ -135,11 +135,11 @@ def test_masks_in_rollout_and_update():
         return True
 
     first = team.get_env().action_masks() or {}
-    assert not first  # before the first reset
+    assert not first  # There are none before the first reset
     team.learn(64, callback=watch)
     for agent, model in team.agents.items():
         buffer = model.rollout_buffer
-        # the update has put each copy's steps one after the other; masks are those of the observation acted on
+        # After the update each copy's steps stand one after the other. Masks belong to the observation that was acted on
         stored = buffer.action_masks.reshape(2, 32, -1).astype(bool)
         np.testing.assert_array_equal(stored[:, 1:], np.array(given[agent])[:-1].swapaxes(0, 1))
         acted = buffer.actions.reshape(-1).astype(int)
@@ -148,7 +148,7 @@ def test_masks_in_rollout_and_update():
 
 @pytest.fixture
 def installed(monkeypatch):
-    """A package of that name which registers two maps, in other words the fake by its id."""
+    """Install an empty module of that name, and register the fake under the ids of three maps."""
     monkeypatch.setitem(sys.modules, "smaclite", ModuleType("smaclite"))
     for name in ("2s3z", "custom", "secret"):
         id = f"smaclite/{name}-v0"
@@ -172,7 +172,7 @@ def test_training(tmp_path):
     train_save_load_evaluate(partial(fake, 20), tmp_path, MaskableBeliefPPO)
 
 
-# Where the package is installed
+# Tests that need the package itself
 
 
 def test_the_fake_has_the_interface_of_the_package():

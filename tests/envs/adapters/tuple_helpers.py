@@ -1,4 +1,4 @@
-"""What the tests of the Gymnasium tuple environments use."""
+"""Teams and checks that the tests of the Gymnasium tuple environments share."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,15 +15,19 @@ POLICY_KWARGS: dict[str, Any] = {"net_arch": [8], "embedding_dim": 8, "latent_di
 
 
 def make_team(make_env: Callable[[], Any], n_steps: int, algorithm: Any = BeliefPPO, **kwargs: Any) -> Any:
+    """Return a small team in two copies of the environment."""
     env = make_team_env(make_env, n_envs=2, seed=0)
     return Team(algorithm, "BeliefPolicy", env, seed=0, n_steps=n_steps, policy_kwargs=POLICY_KWARGS, **{**SMALL, **kwargs})
 
 
 def train_save_load_evaluate(make_env: Callable[[], Any], folder: Any, algorithm: Any = BeliefPPO) -> list:
     """
-    Two short iterations, then the same team from its file.
+    Train a team for two short iterations, save it, load it, evaluate it and train it further.
 
-    :return: returns of two evaluation episodes
+    :param make_env: Makes one environment
+    :param folder: Where the team is saved
+    :param algorithm: Class of the agents
+    :return: Returns of two evaluation episodes
     """
     team = make_team(make_env, 16, algorithm)
     before = {agent: _weights(model) for agent, model in team.agents.items()}
@@ -47,10 +51,13 @@ def check_advantages(
     make_env: Callable[[], Any], terminates: Callable[[np.ndarray], bool], n_steps: int, algorithm: Any = BeliefPPO
 ) -> list[bool]:
     """
-    Compare the advantages in all agents' rollout buffers with those computed here, from what the environment did.
+    Compare the advantages in all agents' rollout buffers with those computed here from the environment's own steps.
 
-    :param terminates: of an episode's last observation, whether the episode terminated and was not merely cut
-    :return: for each end of an episode that was in the rollout, whether it was a termination
+    :param make_env: Makes one environment
+    :param terminates: Tells from an episode's last observation whether the episode terminated, rather than being truncated
+    :param n_steps: Length of a rollout, of which there are two
+    :param algorithm: Class of the agents
+    :return: For each end of an episode within a rollout, whether it was a termination
     """
     team = make_team(make_env, n_steps, algorithm, gamma=0.9, gae_lambda=0.8, n_epochs=1)
     watches = {agent: _Advantages(terminates) for agent in team.agents}
@@ -60,6 +67,8 @@ def check_advantages(
 
 
 class _Advantages(BaseCallback):
+    """Callback that computes one agent's advantages by their definition and compares them with its buffer's."""
+
     def __init__(self, terminates: Callable[[np.ndarray], bool]):
         super().__init__()
         self.terminates = terminates
@@ -68,7 +77,7 @@ class _Advantages(BaseCallback):
         self.compared = 0
 
     def _on_step(self) -> bool:
-        # Before SB3 adds the bootstrap values to the rewards
+        # Copied now, since SB3 adds the bootstrapped values to the rewards in place
         last = [info.get("terminal_observation") for info in self.locals["infos"]]
         self.steps.append((self.locals["rewards"].copy(), self.locals["new_obs"].copy(), last))
         return True
@@ -88,7 +97,7 @@ class _Advantages(BaseCallback):
                     self.ends.append(self.terminates(last[copy]))
                     following = 0.0 if self.ends[-1] else value(last[copy])
                 elif t + 1 < len(self.steps):
-                    following = buffer.values[t + 1, copy]  # a belief is sampled when acting: not what value() says
+                    following = buffer.values[t + 1, copy]  # Not value(), since acting has sampled the belief
                 else:
                     following = value(new_obs[copy])
                 errors.append(rewards[copy] + gamma * following - buffer.values[t, copy])

@@ -1,4 +1,4 @@
-"""Helpers that the tests of SMAX share."""
+"""Makers and helpers that the tests of SMAX share."""
 
 from typing import Any
 
@@ -6,35 +6,30 @@ import numpy as np
 
 from sb3_belief.envs.adapters import smax
 
-# Tests look inside, at what the types do not promise
+# Typed as Any, since the tests also look at attributes that the public types do not have
 make: Any = smax.make
-
-
 make_batched: Any = smax.make_batched
 
-
-# The enemies do not shoot: battles that random play neither wins nor loses soon
+# Enemies that do not shoot, so that random play neither wins nor loses soon
 PEACE: dict[str, Any] = {"enemy_shoots": False, "walls_cause_death": False}
 
 UNIT_FEATURES, OWN_FEATURES, STOP = 13, 10, 4
 
 
 def masked_choice(masks, generator):
+    """Return random legal actions of all agents, ``[n_copies]`` each."""
     return {agent: (generator.random(mask.shape) * mask).argmax(axis=-1) for agent, mask in masks.items()}
 
 
 def set_step(state, step):
-    """
-    Change a copy's state as if ``step`` steps had been made: it is the only whole number of its own that starts at 0.
-    """
+    """Change a copy's state as if ``step`` steps of the episode had been made."""
+    # The step counter is the only integer scalar of the state
     (index,) = [k for k, leaf in enumerate(state["leaves"]) if leaf.shape == () and leaf.dtype == np.int32]
     state["leaves"][index] = np.array(step, dtype=np.int32)
 
 
 def attack(env):
-    """
-    :return: actions of a team that goes right until it can shoot, then at the enemy with the lowest number
-    """
+    """Return actions of a team that walks right until it can shoot, and then shoots at the enemy with the lowest number."""
     masks = env.battles.masks[:, 0]
     return {
         agent: int(mask[5:].argmax()) + 5 if mask[5:].any() else (1 if mask[1] else STOP)

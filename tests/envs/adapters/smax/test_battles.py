@@ -1,4 +1,4 @@
-"""The course of SMAX's battles: visibility, masks, ends and deaths."""
+"""SMAX's battles: visibility, masks, ends and deaths. They need jaxmarl in an environment of its own (``make test-smax``)."""
 
 from importlib.util import find_spec
 
@@ -20,14 +20,14 @@ from tests.envs.adapters.smax.helpers import (
 pytestmark = pytest.mark.skipif(find_spec("jaxmarl") is None, reason="jaxmarl is not installed: run make test-smax")
 
 
-# SMAX's unit types by number, m M s Z z h, as its paper and source give them; here on their own, not read from the package
+# Sight and shooting ranges of SMAX's unit types in the order m M s Z z h, taken from its paper and source. They are repeated
+# here, rather than read from the package, so that the tests do not depend on what they check
 SIGHT = np.array([9, 10, 10, 9, 8, 9])
-
-
 RANGE = np.array([5, 6, 6, 2, 2, 5])
 
 
 def in_sight(units, n_agents):
+    """Compute from the positions which agent sees which other, bool ``[n_agents, n_agents - 1]``."""
     positions, types, alive = (units[name][:n_agents] for name in ("positions", "types", "alive"))
     rows = []
     for i in range(n_agents):
@@ -44,7 +44,7 @@ def test_visibility_equals_an_independent_computation(map_name):
     env.seed(1)
     env.reset()
     generator = np.random.default_rng(1)
-    # The battles at the end of a step, before any is reset
+    # The units of all battles at the end of a step, before any battle is reset
     units: list[dict[str, np.ndarray]] = []
     step = env.battles.step
 
@@ -54,7 +54,7 @@ def test_visibility_equals_an_independent_computation(map_name):
         return result
 
     env.battles.step = step_and_look
-    # The step limit comes first, so that some are alive at an end
+    # The battles start near the step limit, so that some units are still alive at an end
     states = env.get_state()
     for state in states:
         set_step(state, 85)
@@ -62,7 +62,7 @@ def test_visibility_equals_an_independent_computation(map_name):
     before = np.ones((4, n_agents), dtype=bool)
     asymmetric = hidden = ends = np.int64(0)
     for _ in range(300):
-        # Half of the time in a direction of one's own, so that the team scatters
+        # Half of the time each unit walks in a direction of its own, so that the team scatters
         actions = masked_choice(env.action_masks(), generator)
         drift = {agent: np.full(4, i % 4) for i, agent in enumerate(env.possible_agents)}
         chosen = {agent: np.where(generator.random(4) < 0.5, actions[agent], drift[agent]) for agent in actions}
@@ -78,7 +78,7 @@ def test_visibility_equals_an_independent_computation(map_name):
             hidden += (alive[:, None] & alive & ~seen).sum() - alive.sum()
             ends += dones[copy] and alive.any()
             before[copy] = True if dones[copy] else alive
-            # What is seen is what the observation shows: blocks of units out of sight are empty
+            # The observation agrees: the blocks of units out of sight are empty
             last = info["terminal_observation"] if dones[copy] else None
             for i, agent in enumerate(env.possible_agents):
                 obs = last[agent] if last else env.battles.observations[i, copy]
@@ -107,7 +107,7 @@ def test_the_last_actions_of_allies_are_blanked_unless_asked_for(mixed):
             full = other[agent][:, :width].reshape(4, n_allies - 1, UNIT_FEATURES)
             assert not blocks[:, :, 3:6].any()
             np.testing.assert_array_equal(np.delete(blocks, [3, 4, 5], axis=2), np.delete(full, [3, 4, 5], axis=2))
-            # The enemies' stay
+            # The last actions of the enemies remain
             np.testing.assert_array_equal(obs[agent][:, width:], other[agent][:, width:])
             for copy in np.flatnonzero(~dones):
                 for j, ally in enumerate(a for a in mixed.possible_agents if a != agent):
@@ -144,7 +144,7 @@ def test_no_illegal_action_is_ever_sent(mixed, heeds_masks):
     battles._program = Spy()
     try:
         stopped = shots = 0
-        for _ in range(2500):  # times 4 copies
+        for _ in range(2500):  # Steps of 4 copies each
             before = [battles.units(copy) for copy in range(4)]
             masks = mixed.action_masks()
             everything = {agent: np.ones_like(mask) for agent, mask in masks.items()}
@@ -209,7 +209,7 @@ def test_the_battle_ends_for_all_at_once():
     with pytest.raises(ValueError, match="reset"):
         env.step(dict.fromkeys(env.possible_agents, STOP))
 
-    # The same last step at the step limit is still a win, and an idle one is a truncation and no success
+    # At the step limit the same last step is still a win, while an idle one truncates without success
     state = states[-1]
     set_step(state["battle"], 100)
     for actions, won in ((None, True), (dict.fromkeys(env.possible_agents, STOP), False)):
@@ -217,7 +217,7 @@ def test_the_battle_ends_for_all_at_once():
         _, _, terminations, truncations, infos = env.step(attack(env) if actions is None else actions)
         assert set(terminations.values()) == {won} and set(truncations.values()) == {not won}
         assert {info["is_success"] for info in infos.values()} == {won} and not env.agents
-    # SMAX looks at the clock before it moves on: one step more than max_steps
+    # SMAX compares the clock before it advances, so that an episode has one step more than max_steps
     set_step(state["battle"], 99)
     env.set_state(state)
     env.step(dict.fromkeys(env.possible_agents, STOP))
@@ -254,7 +254,7 @@ def test_a_draw_is_no_success(mixed):
     states = mixed.get_state()
     for leaf in states[2]["leaves"]:
         if leaf.dtype == np.float32 and leaf.shape == (10,) and (leaf > 1).all():
-            leaf[:] = 0.0  # everybody's health
+            leaf[:] = 0.0  # The health of all units
     mixed.set_state(states)
     _, _, dones, infos = mixed.step({agent: np.full(4, STOP) for agent in mixed.possible_agents})
     assert dones.tolist() == [False, False, True, False]

@@ -1,4 +1,4 @@
-"""SMAX as a batch and one by one. Needs jaxmarl in an environment of its own: ``make test-smax``."""
+"""SMAX in batches and one by one. The tests need jaxmarl in an environment of its own (``make test-smax``)."""
 
 import pickle
 import subprocess
@@ -28,10 +28,8 @@ from tests.envs.adapters.smax.helpers import (
 
 pytestmark = pytest.mark.skipif(find_spec("jaxmarl") is None, reason="jaxmarl is not installed: run make test-smax")
 
-
+# Typed as Any, since the tests also look at attributes that the public types do not have
 make_team_env: Any = team.make_team_env
-
-
 Team: Any = team.Team
 
 
@@ -144,7 +142,7 @@ def test_a_single_environment_can_be_copied():
         first, second = env.step(actions), other.step(actions)
         for agent in env.agents:
             np.testing.assert_array_equal(first[0][agent], second[0][agent])
-    # Before the first reset too
+    # An environment can be copied before its first reset too
     pickle.loads(pickle.dumps(make("3m", **PEACE))).reset(seed=0)
 
 
@@ -153,7 +151,7 @@ def test_pictures():
     env.reset(seed=0)
     picture = env.render()
     assert picture.dtype == np.uint8 and picture.shape == (400, 400, 3)
-    # Allies on the left, blue; enemies on the right, red
+    # Allies are blue and on the left, enemies red and on the right
     red, blue = picture[..., 0].astype(int), picture[..., 2].astype(int)
     assert (blue[:, :200] - red[:, :200] > 50).any() and (red[:, 200:] - blue[:, 200:] > 50).any()
     assert not (blue[:, 200:] - red[:, 200:] > 50).any()
@@ -219,24 +217,26 @@ def test_a_team_learns_is_saved_and_evaluated(tmp_path, algorithm):
 
 
 def test_time_limits_are_bootstrapped_and_ends_are_not(mixed):
-    """The advantages of a stored rollout against a computation of their own."""
+    """The advantages of a stored rollout equal those computed here by their definition."""
     import torch as th
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Keep(BaseCallback):
+        """Callback that keeps rewards, dones and infos of all steps."""
+
         def __init__(self):
             super().__init__()
             self.rows: list[tuple] = []
 
         def _on_step(self):
-            # SB3 adds the bootstrapped values to the rewards in place
+            # Copied now, since SB3 adds the bootstrapped values to the rewards in place
             self.rows.append((self.locals["rewards"].copy(), self.locals["dones"].copy(), self.locals["infos"]))
             return True
 
     mixed.seed(3)
     mixed.reset()
-    # Two copies at their limit at once, the others fight on
+    # Two copies start near their step limit, the other two play on
     states = mixed.get_state()
     for state in states[:2]:
         set_step(state, 90)
@@ -255,7 +255,7 @@ def test_time_limits_are_bootstrapped_and_ends_are_not(mixed):
         with th.no_grad():
             return float(policy.predict_values(policy.obs_to_tensor(obs)[0]))
 
-    # As the buffer hands them out: one copy after the other
+    # After the update the rows of a copy stand one after the other
     values, advantages = buffer.values.reshape(4, 60), buffer.advantages.reshape(4, 60)
     cuts = ends = 0
     for copy in range(4):
