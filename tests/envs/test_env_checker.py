@@ -1,4 +1,4 @@
-"""The contract checker: what is right passes, and each fault is found and said with what to change."""
+"""The environment checker: correct environments pass, and each fault is reported with what to change."""
 
 import threading
 from typing import Any, ClassVar
@@ -15,12 +15,13 @@ from tests.team.toy_envs import MaskedEnv, MixedEnv, PartneredEnv, ScriptedEnv, 
 
 
 def failures(env, **kwargs):
+    """Return the texts of the failures by topic."""
     return {finding.topic: finding.text for finding in check_team_env(env, n_steps=40, **kwargs).failures}
 
 
 @pytest.mark.parametrize("env", [*registered_ids(), ToyEnv, MaskedEnv, MixedEnv, PartneredEnv, ScriptedEnv])
 def test_what_is_right_passes(env):
-    # ScriptedEnv tells by its observations how many episodes it has had
+    # These two count their episodes in what they return, and a seed does not reset that count
     assert set(failures(env)) == ({"seeding"} if env in (ScriptedEnv, PartneredEnv) else set())
 
 
@@ -39,9 +40,9 @@ def test_a_report_says_what_was_seen():
 
 class Faulty(ToyEnv):
     """
-    One fault of a ``ToyEnv`` from step 3 on.
+    A ``ToyEnv`` with one fault from step 3 on.
 
-    :param fault: name of the method that makes it
+    :param fault: Name of the method that makes the fault
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "faulty"}
@@ -134,7 +135,11 @@ def test_each_fault_is_found_and_says_what_to_change(fault, topic, message):
 
 
 class Masks(MaskedEnv):
-    """:param mask: what agent_0 gets at step 2, None: nothing"""
+    """
+    A ``MaskedEnv`` in which ``agent_0`` has a given mask at step 2.
+
+    :param mask: The mask. None for no mask
+    """
 
     def __init__(self, mask):
         super().__init__(n_agents=2)
@@ -161,7 +166,11 @@ def test_masks_that_cannot_be(mask, message):
 
 
 class Sight(ToyEnv):
-    """:param told: what visibility() returns"""
+    """
+    A ``ToyEnv`` with a given visibility.
+
+    :param told: What ``visibility()`` returns
+    """
 
     def __init__(self, told):
         super().__init__(n_agents=3)
@@ -188,12 +197,12 @@ def test_visibility_that_cannot_be(told, message):
 def test_one_sided_visibility_is_told():
     told = {"agent_0": [True, True], "agent_1": [False, False], "agent_2": [True, False]}
     text = str(check_team_env(Sight, {"told": told}, n_steps=20))
-    # 0-1 is one-sided, 0-2 and 1-2 are not
+    # Of the three pairs only 0 and 1 are one-sided
     assert "50.0% of the others' actions are visible, one-sided in 33.3% of the pairs" in text
 
 
 class Unseeded(ToyEnv):
-    """Draws from a generator that reset() does not seed."""
+    """A ``ToyEnv`` with a reward from a generator that ``reset()`` does not seed."""
 
     def step(self, actions):
         result = super().step(actions)
@@ -203,7 +212,7 @@ class Unseeded(ToyEnv):
 
 
 class LeftOver(ToyEnv):
-    """Begins where the last episode ended."""
+    """A ``ToyEnv`` whose first observations depend on how often it has been reset."""
 
     start = 0.0
 
@@ -220,7 +229,11 @@ def test_seeds_that_do_not_decide_all():
 
 
 class StateOf(ToyEnv):
-    """:param forgets: whether the state lacks the generators"""
+    """
+    A ``ToyEnv`` with ``get_state()`` and ``set_state()``.
+
+    :param forgets: Whether the state lacks the generators
+    """
 
     def __init__(self, forgets: bool):
         super().__init__()

@@ -1,3 +1,5 @@
+"""Ids of environments: the package's own, those of suites, those of users, and what happens if a package is missing."""
+
 import re
 import subprocess
 import sys
@@ -31,7 +33,7 @@ def test_all_ids_make_what_they_say():
     games = ["convention-swap", "convention-watch-act", "convention-redraw"]
     assert registered_ids() == levels + games
     for env_id in games:
-        # what they stand for is tested with the environment
+        # The arguments behind the ids are tested with the environment
         env, batched = make_parallel_env(env_id), make_batched_env(env_id, 3)
         assert isinstance(env, SwitchingConvention) and isinstance(batched, SwitchingConventionVecEnv)
         assert batched.config == env.config
@@ -86,7 +88,7 @@ def test_importing_environments_loads_no_pygame_and_no_team():
         "import sys; import sb3_belief.envs.registry; before = 'sb3_belief.team' in sys.modules;"
         "sys.modules.pop('sb3_belief', None); print(before, 'pygame' in sys.modules, 'sb3_belief.zoo' in sys.modules)"
     )
-    # sb3_belief's own __init__ imports the team package. What counts here is what envs imports, so it is imported without it
+    # sb3_belief/__init__.py imports the team package. An empty package takes its place, since only envs' own imports count
     bare = (
         "import sys, types, pathlib; package = types.ModuleType('sb3_belief');"
         "package.__path__ = [str(pathlib.Path('sb3_belief').resolve())]; sys.modules['sb3_belief'] = package;"
@@ -97,7 +99,7 @@ def test_importing_environments_loads_no_pygame_and_no_team():
 
 @pytest.fixture
 def own_registry(monkeypatch):
-    """Registrations of a test end with it."""
+    """Give the test a registry of its own, so that its registrations end with it."""
     monkeypatch.setattr(registry_module, "_SPECS", dict(registry_module._SPECS))
 
 
@@ -173,7 +175,7 @@ def test_users_register_theirs_with_a_decorator(own_registry):
     assert registered_ids()[-1] == "my/toy-2"
     env = make_parallel_env("my/toy-2", limit=5)
     assert type(env) is first and (len(env.possible_agents), env.limit) == (4, 5)
-    # a notebook's cell that is run again
+    # A class may be registered again, as happens when a notebook's cell is run again
     assert type(make_parallel_env("my/toy-2")) is not define(4)
     assert make_parallel_env("my/toy-2").default == 4
     for taken in ("my/toy-2", "traffic-junction-easy"):
@@ -183,7 +185,7 @@ def test_users_register_theirs_with_a_decorator(own_registry):
 
 @pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
 def test_what_a_user_registered_makes_a_team(own_registry, vec_env):
-    # a worker process knows nothing of what was registered here
+    # A worker process does not have what was registered in this one
     register("mine")(lambda limit=7: ToyEnv(2, limit))
     env = make_team_env("mine", n_envs=2, vec_env=vec_env, env_kwargs={"limit": 1})
     env.reset()

@@ -1,4 +1,4 @@
-"""SuperSuit before the agents are split: what a team is told besides observations stays as it was."""
+"""SuperSuit's wrappers around a team's environment keep what it offers besides observations: visibility, masks and ends."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +24,12 @@ WRAPPERS: dict[str, Callable[[ParallelEnv], ParallelEnv]] = {
 
 
 def played(wrapper: Callable[[ParallelEnv], ParallelEnv] | None) -> list[dict[str, Any]]:
-    """Sixty steps, three episodes, of a junction where cars come and go, with the same actions whatever is wrapped."""
+    """
+    Play sixty steps (three episodes) of a junction, with the same actions whatever the wrapper.
+
+    :param wrapper: The wrapper. None for none
+    :return: For each step visibility, flags, masks, rewards and success
+    """
     env = make_team_env("traffic-junction-easy", n_envs=1, seed=0, wrapper=wrapper or (lambda env: env))
     env.reset()
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What policies with and without a history can reach in the switching conventions."""
+"""The returns that policies with and without a memory reach in the switching conventions."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecE
 
 
 class Lookup:
-    """Plays at each cue what the leader did at it in the last rollout, at random if it did not come up."""
+    """Policy that does at each cue what the leader did at it in the last rollout, and acts at random at other cues."""
 
     def __init__(self, m, seed=0):
         self.m, self.generator = m, np.random.default_rng(seed)
@@ -27,23 +27,21 @@ class Lookup:
 
 
 class Knowing(Lookup):
-    """Knows the convention."""
+    """Policy that knows the current convention."""
 
     def act(self, env, cues):
         return env.game.conventions[np.arange(len(cues)), cues]
 
 
 class Constant(Lookup):
-    """Never looks."""
+    """Policy that always does the same."""
 
     def act(self, env, cues):
         return np.ones(len(cues), int)
 
 
 def rewards_by_rollout(follower, n_rollouts, **kwargs):
-    """
-    :return: mean reward of each rollout of 32 copies
-    """
+    """Return the mean reward of each rollout of 32 copies."""
     env = SwitchingConventionVecEnv(32, **kwargs)
     env.seed(0)
     cues = env.reset()["follower"]
@@ -67,14 +65,14 @@ def test_who_knows_the_convention_gets_all(kwargs):
 
 def test_who_never_looks_gets_one_in_m():
     means = rewards_by_rollout(Constant(4), 400, m=4, K=1)
-    # a constant action is right at a quarter of the cues, whatever the convention
+    # A constant action is right at a quarter of the cues, whatever the convention
     assert abs(means.mean() - 0.25) < 5 * means.std() / np.sqrt(len(means)) < 0.02
 
 
 @pytest.mark.parametrize("K", [2, 5])
 def test_who_looks_up_the_last_rollout_gets_the_optimum(K):
     means = rewards_by_rollout(Lookup(4), 150 * K, m=4, K=K).reshape(-1, K)
-    # what was learned of the convention before says a little of which one it is not, and is no more right than a guess
+    # What was learned of the previous convention excludes little else than that one, so it is right no more often than a guess
     first = means[:, 0]
     assert abs(first.mean() - 0.25) < 4 * first.std() / np.sqrt(len(first)) < 0.1
     assert (means[:, 1:] == 1.0).all()

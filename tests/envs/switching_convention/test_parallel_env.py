@@ -1,4 +1,4 @@
-"""The switching conventions: what is rewarded, what is told of the leader, when it changes its mind."""
+"""The switching conventions: rewards, what the follower sees of the leader, and when the convention changes."""
 
 import pickle
 from typing import Any
@@ -17,9 +17,7 @@ from tests.envs.switching_convention.variants import VARIANTS
 
 
 def conventions(n, m=4, K: int | None = 1, rollout_steps=1, **kwargs):
-    """
-    :return: the first n conventions of an environment, as it shows them
-    """
+    """Return the first ``n`` conventions that an environment plays."""
     env = SwitchingConvention(m=m, K=K, rollout_steps=rollout_steps, **kwargs)
     found = []
     for _ in range(n):
@@ -33,7 +31,7 @@ def conventions(n, m=4, K: int | None = 1, rollout_steps=1, **kwargs):
 
 @pytest.mark.parametrize("kwargs", VARIANTS)
 def test_pettingzoo_api_and_seeds(kwargs):
-    # any warning would be a deviation from the interface
+    # A warning of PettingZoo's tests would be a deviation from the interface
     parallel_api_test(SwitchingConvention(**kwargs), num_cycles=100)
     parallel_seed_test(lambda: SwitchingConvention(**kwargs), num_cycles=100)
 
@@ -58,7 +56,7 @@ def test_rewards_and_leader_step_by_step(kwargs):
     for age in range(4 * life + rules.rollout_steps):
         cue, convention = obs["follower"], env.convention
         assert sorted(convention) == list(range(rules.m)) and 0 <= cue < rules.m
-        # every other time what the leader will do, so that rewards are not rare
+        # At every other step the follower does what the leader will do, so that rewards are not rare
         action = int(convention[cue]) if age % 2 else int(generator.integers(rules.m))
         obs, rewards, terminations, truncations, infos = env.step({"follower": action})
         counts = rules.rewarded == "always" or age % life >= life - rules.rollout_steps
@@ -106,7 +104,7 @@ def test_the_sequence_of_conventions_is_one_of_the_seed():
     assert sum(np.array_equal(a, b) for a, b in zip(first, other, strict=True)) < 12
     assert len({tuple(c) for c in conventions(9, K=None, seed=7)}) == 1
     assert np.array_equal(conventions(1, K=None, seed=7)[0], first[0])
-    # the cues' seed has no say in it
+    # The seed of the cues does not influence the conventions
     env = SwitchingConvention(K=2, rollout_steps=2, seed=7)
     for seed in (0, 7, 12):
         env.reset(seed=seed)
@@ -117,9 +115,9 @@ def test_conventions_are_uniformly_drawn():
     drawn = np.array(conventions(600, m=3))
     _, counts = np.unique(drawn, axis=0, return_counts=True)
     assert len(counts) == 6
-    # the 99.9 % point of chi-squared with 5 degrees of freedom
+    # The 99.9 % quantile of chi-squared with 5 degrees of freedom
     assert ((counts - 100) ** 2 / 100).sum() < 20.5
-    # one says nothing of the next
+    # Successive conventions are independent
     again = (drawn[1:] == drawn[:-1]).all(axis=1).mean()
     assert abs(again - 1 / 6) < 0.05
 
@@ -138,7 +136,7 @@ def test_a_reset_with_a_seed_begins_life_anew_and_one_without_goes_on():
     first = [env.reset(seed=1), *play(env, 19)]
     assert [env.reset(seed=1), *play(env, 19)] == first
     assert [env.reset(seed=2), *play(env, 19)] != first
-    # 3 of the 8 steps of the first convention, and a reset in the middle of an episode
+    # The environment is reset in the middle of an episode, after 3 of the 8 steps of the first convention
     env.reset(seed=1)
     start = env.convention
     play(env, 3)
@@ -241,7 +239,7 @@ def test_a_follower_learns_what_the_leader_does():
     small: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "history_length": 32, "device": "cpu"}
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, policy_kwargs=policy_kwargs, **small).learn(96)
     model: Any = team.agents["follower"]
-    # the third rollout: the second convention in full, told at every step
+    # The third rollout plays only the second convention, and the leader's action is visible at every step
     (second,) = {tuple(row) for row in env.get_attr("convention")}
     buffer = model.rollout_buffer
     played = np.array(second)[buffer.observations.astype(int).ravel()]

@@ -1,4 +1,4 @@
-"""Copies of the switching conventions in one batch: they equal single environments, and their state can be restored."""
+"""The switching conventions as one batch: its copies equal single environments to the bit, and its state can be restored."""
 
 import pickle
 from typing import Any
@@ -91,7 +91,7 @@ def test_a_batch_equals_the_general_vectoriser(vec_env):
         np.testing.assert_array_equal(rewards, rewards2)
         np.testing.assert_array_equal(dones, dones2)
         for info, info2 in zip(infos, infos2, strict=True):
-            # worker processes say at every step that no limit was reached
+            # Worker processes report at every step whether a limit was reached, the batch only at an end
             assert info.keys() | {"TimeLimit.truncated"} == info2.keys() | {"TimeLimit.truncated"}
             for key in info2.keys() - {"episode", "terminal_observation"}:
                 np.testing.assert_array_equal(info.get(key, False), info2[key], err_msg=key)
@@ -118,7 +118,7 @@ def test_state_of_a_batch_resumes_exactly():
 
     def play(env, n_steps):
         steps = [env.step({"follower": np.arange(3) % 4}) for _ in range(n_steps)]
-        # all but the wall-clock time of the monitoring, which starts anew
+        # All but the wall-clock time that the monitor writes
         return [
             (obs["follower"].tolist(), rewards.tolist(), dones.tolist(), [info["scripted_actions"].tolist() for info in infos])
             for obs, rewards, dones, infos in steps

@@ -1,4 +1,4 @@
-"""Arguments of the switching conventions that several tests go through."""
+"""Arguments of the switching conventions that the tests of both forms are parametrised with."""
 
 from typing import Any
 

@@ -1,3 +1,5 @@
+"""Rules of the Traffic Junction: moves, collisions, arrivals, rewards and limits, in both orders of a step."""
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ ORDERS = ("commnet", "ic3net")
 
 
 def cell_of(core, slot):
+    """Return row and column of a car."""
     return divmod(int(core.layout.cell[core.place[0, slot]]), core.layout.level.size)
 
 
@@ -30,7 +33,7 @@ def test_gas_moves_brake_waits_and_waiting_costs(order):
 @pytest.mark.parametrize("n_cars", [2, 3, 4])
 def test_each_partner_of_a_collision_costs_five(order, n_cars):
     core = quiet_core(order=order)
-    # at (6,6) from the top and from the east; the others wait there already
+    # Two cars arrive at (6, 6), from the top and from the east; the others wait there already
     put(core, 0, TOP, STRAIGHT, 5)
     put(core, 3, EAST, STRAIGHT, 6)
     put(core, 5, TOP, RIGHT, 6)
@@ -47,7 +50,7 @@ def test_each_partner_of_a_collision_costs_five(order, n_cars):
     np.testing.assert_allclose(result.rewards[0, here], -5.0 * (n_cars - 1) - 0.01)
     assert core.n_collisions[0] == n_cars * (n_cars - 1) / 2
     assert np.flatnonzero(core.crashed[0]).tolist() == [6 * 14 + 6]
-    # they overlap and go on
+    # Cars that have collided drive on
     core.step(gas(core))
     assert cell_of(core, 0) == (7, 6)
     assert cell_of(core, 3) == (6, 5)
@@ -72,7 +75,7 @@ def test_commnet_removes_on_the_last_cell_and_ic3net_beyond_it():
             assert result.left[0, 0] == (k == n_steps - 1)
         assert not core.on_road[0, 0]
         assert core.tau[0, 0] == 0
-        # in commnet order it is still on the road when rewards are given, in ic3net order not any more
+        # In commnet order the car is still on the road when rewards are computed, in ic3net order no longer
         np.testing.assert_allclose(result.rewards[0, 0], -0.21 if order == "commnet" else 0.0)
 
 
@@ -85,7 +88,7 @@ def test_ic3net_car_may_wait_on_its_last_cell():
 
 def test_commnet_cars_collide_on_the_last_cell_before_removal():
     core = quiet_core()
-    # two routes that end in (13, 6), one cell before it
+    # Two routes that end in (13, 6), each car one cell before it
     put(core, 0, TOP, STRAIGHT, 12)
     put(core, 1, WEST, RIGHT, 11)
     result = core.step(gas(core))
@@ -115,7 +118,7 @@ def test_no_arrival_without_a_free_slot():
     for slot in range(9):
         put(core, slot, TOP, STRAIGHT, slot + 1)
     core.step(gas(core, *range(9)))
-    # four entries want a car each, one slot was free
+    # A car arrives at each of the four entries, and one slot was free
     assert core.on_road.all()
     assert (core.layout.cell[core.place[0]] == 6).sum() == 1
     before = core.place.copy()
@@ -136,11 +139,11 @@ def test_arrival_in_an_occupied_entry_collides_at_once_in_ic3net_only():
         if order == "commnet":
             assert core.n_collisions[0] == 0
             np.testing.assert_allclose(results[order].rewards[0, [0, 7]], [-0.01, 0.0])
-            # the one leaves, the other stays: nothing happens
+            # One car leaves the cell and the other stays, so they do not collide
             assert not core.step(gas(core, 7)).partners.any()
         else:
             assert core.n_collisions[0] == 1
-            # who arrives has not acted
+            # The car that arrives has not acted
             np.testing.assert_allclose(results[order].rewards[0, [0, 7]], [-5.01, 0.0])
             assert results[order].partners[0, [0, 7]].tolist() == [1, 1]
 
@@ -171,7 +174,7 @@ def test_arrivals_are_bernoulli_uniform_over_slots_and_routes():
     core.reset()
     core.step(gas(core))
     n_cars = core.on_road.sum()
-    # 8000 trials with p = 0.2: standard deviation 36
+    # 8,000 trials with p = 0.2 have a standard deviation of 36
     assert abs(n_cars - 1600) < 4 * 36
     per_slot = core.on_road.sum(axis=0)
     assert np.abs(per_slot - n_cars / 10).max() < 4.5 * np.sqrt(n_cars / 10)
@@ -202,7 +205,7 @@ def test_reset_of_some_copies_leaves_the_others():
     assert not core.on_road[1].any()
     np.testing.assert_array_equal(core.place[[0, 2]], place[[0, 2]])
     assert time.tolist() == [7, 7, 7]
-    # every copy still reads its own draws
+    # Every copy still reads its own draws
     core.step(gas(core))
     assert core.time.tolist() == [8, 1, 8]
 

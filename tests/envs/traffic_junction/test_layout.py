@@ -1,3 +1,5 @@
+"""Roads of the Traffic Junction: routes of the three levels, and the tables made of them."""
+
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +13,7 @@ TOP_LEFT = [(row, 6) for row in range(8)] + [(7, column) for column in range(7, 
 
 
 def turned(route, quarters, size):
+    """Return a route rotated by a number of quarter turns."""
     for _ in range(quarters):
         route = [(column, size - 1 - row) for row, column in route]
     return route
@@ -44,9 +47,9 @@ def test_hard_connects_each_entry_with_the_seven_other_roads():
         ends = {layout.routes[r][-1] for r in numbers}
         assert len(ends) == 7
         assert all(layout.routes[r][0] == entry for r in numbers)
-        # the road end that the car came from is the one it may not take
+        # A car may not leave by the road that it came from
         assert all(abs(end[0] - entry[0]) + abs(end[1] - entry[1]) > 1 for end in ends)
-    # a quarter turn maps the routes onto themselves
+    # A quarter turn maps the routes onto themselves
     assert {tuple(turned(route, 1, 18)) for route in layout.routes} == set(layout.routes)
 
 

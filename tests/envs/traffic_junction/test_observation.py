@@ -1,3 +1,5 @@
+"""What the cars of a Traffic Junction observe, and which other cars they see."""
+
 import numpy as np
 import pytest
 
@@ -29,7 +31,7 @@ def test_a_car_alone():
 def test_cars_in_view_and_where():
     core = quiet_core(observe_last_actions=True)
     put(core, 0, TOP, STRAIGHT, 5)  # (5, 6)
-    put(core, 4, EAST, RIGHT, 6)  # (6, 7), and one further: (5, 7)
+    put(core, 4, EAST, RIGHT, 6)  # (6, 7), moved below by one cell to (5, 7)
     put(core, 7, TOP, RIGHT, 4)  # (4, 6)
     put(core, 8, TOP, LEFT, 4)  # (4, 6)
     put(core, 9, TOP, LEFT, 7)  # (7, 6), two rows away
@@ -40,7 +42,7 @@ def test_cars_in_view_and_where():
     width = 1 + N + R + 1
     cells = obs[0, 0, 5 + R :].reshape(9, width)
     routes = {slot: int(core.layout.route[core.place[0, slot]]) for slot in (4, 7, 8)}
-    # upper centre: two cars, one of which braked
+    # The upper centre cell holds two cars, one of which braked
     ids, both = [float(j in (7, 8)) for j in range(N)], [float(r in (routes[7], routes[8])) for r in range(R)]
     assert cells[1].tolist() == [2.0, *ids, *both, 1.0]
     assert cells[5].tolist() == [1.0, *one_hot(4, N), *one_hot(routes[4], R), 0.0]

@@ -1,3 +1,5 @@
+"""The Traffic Junction as a PettingZoo environment: interface, infos, visibility, seeds and state."""
+
 import json
 import pickle
 
@@ -12,9 +14,7 @@ LEVELS = ("easy", "medium", "hard")
 
 
 def play(env, n_steps, seed=0):
-    """
-    :return: all that n_steps of random actions brought, across episodes
-    """
+    """Return everything that ``n_steps`` steps of random actions return, with visibility and resets, across episodes."""
     generator = np.random.default_rng(seed)
     record = []
     for _ in range(n_steps):
@@ -26,13 +26,14 @@ def play(env, n_steps, seed=0):
 
 
 def same(a, b):
+    """Return whether two results are equal to the bit."""
     return pickle.dumps(a) == pickle.dumps(b)
 
 
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("order", ["commnet", "ic3net"])
 def test_pettingzoo_api_and_seeds(level, order):
-    # any warning would be a deviation from the interface
+    # A warning of PettingZoo's tests would be a deviation from the interface
     parallel_api_test(TrafficJunction(level, order=order), num_cycles=100)
     parallel_seed_test(lambda: TrafficJunction(level, order=order), num_cycles=100)
 
@@ -110,10 +111,10 @@ def test_visibility_is_that_of_the_moment_of_choice():
     put(env.core, 1, TOP, STRAIGHT, 5)
     env._observe()
     actions = dict.fromkeys(env.possible_agents, 0)
-    # two cells apart when they choose, one after
+    # They are two cells apart when they choose, and one cell after the step
     env.step({**actions, "car_1": 1})
     assert not env.visibility()["car_0"].any() and not env.visibility()["car_1"].any()
-    # one apart when they choose, two after
+    # They are one cell apart when they choose, and two cells after the step
     env.step({**actions, "car_0": 1})
     visible = env.visibility()
     assert visible["car_0"].tolist() == [True] + [False] * 8

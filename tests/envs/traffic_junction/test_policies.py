@@ -1,3 +1,5 @@
+"""Reference policies of the Traffic Junction, and the success rates that they are known to reach."""
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ EPISODES = 2048
         (RulePolicy(), "commnet", 0.2, 0.936, 0.03),
         (RulePolicy(), "commnet", 0.1, 0.986, 0.015),
         (RulePolicy(), "commnet", 0.05, 1.0, 0.005),
-        # The reference is one sample of 1,024 episodes (standard error 0.015); 65,536 of ours give 0.630 (0.002)
+        # The expected value is one sample of 1,024 episodes (standard error 0.015); 65,536 episodes give 0.630 (0.002)
         (RulePolicy(), "ic3net", 0.2, 0.661, 0.06),
         (RulePolicy(), "ic3net", 0.1, 0.889, 0.03),
         (RulePolicy(), "ic3net", 0.05, 0.986, 0.015),
@@ -44,6 +46,7 @@ def test_success_of_the_reference_policies(policy, order, arrival_rate, expected
 
 
 def rule_actions(core):
+    """Return the actions of the rule for all slots, given what they observe."""
     obs, _, _ = observe(core)
     policy = RulePolicy(level=core.config.level)
     return [int(a[0]) for a in policy({f"car_{i}": values for i, values in enumerate(obs)}).values()]
@@ -80,7 +83,7 @@ def test_rule_lets_the_lowest_id_leave_a_shared_entry():
 def test_rule_ignores_neighbours_with_other_ways():
     core = quiet_core()
     put(core, 0, TOP, STRAIGHT, 3)
-    put(core, 1, BOTTOM, STRAIGHT, 10)  # beside it, in the other direction
+    put(core, 1, BOTTOM, STRAIGHT, 10)  # Beside the first car, in the opposite direction
     actions = rule_actions(core)
     assert actions[:2] == [0, 0]
 

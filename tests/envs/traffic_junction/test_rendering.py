@@ -1,3 +1,5 @@
+"""Pictures of the Traffic Junction, as arrays and in a window."""
+
 import os
 import sys
 from typing import Any
@@ -20,6 +22,7 @@ def test_missing_pygame_names_the_extra(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def needs_pygame(request):
+    """Skip the tests that draw where pygame is not installed."""
     if "missing_pygame" not in request.node.name:
         pytest.importorskip("pygame")
 
@@ -43,7 +46,7 @@ def test_pictures_show_what_happens_and_nothing_else(level):
     for row, column in occupied:
         y, x = round(32 + (row + 0.5) * side), round((column + 0.5) * side)
         assert changed[y - 5 : y + 6, x - 5 : x + 6].mean() > 0.5
-    # grass stays grass
+    # The grass in the corner does not change
     assert not changed[32 : 32 + int(side), : int(side)].any()
     again = TrafficJunction(level, render_mode="rgb_array", arrival_rate=0.5)
     again.reset(seed=0)
@@ -64,7 +67,7 @@ def test_collisions_are_marked_and_counted():
         pictures.append(env.render().astype(int))
 
     def red(picture):
-        """Number of pixels in the colour of the mark, within a cell and a half of (6, 6)."""
+        """Return the number of pixels in the colour of the collision mark, in (6, 6) and one and a half cells around it."""
         part = picture[32 + 195 : 32 + 369, 195:369]
         return (np.abs(part - (240, 62, 44)).max(axis=2) < 25).sum()
 

@@ -1,3 +1,5 @@
+"""The Traffic Junction as one batch: its copies equal single environments to the bit."""
+
 import pickle
 
 import numpy as np
@@ -19,6 +21,15 @@ VARIANTS = [
 
 
 def assert_same_step(e, i, obs, step, single: ParallelEnv):
+    """
+    Compare copy ``i`` of a batch with a single environment after the same step.
+
+    :param e: What the single environment's ``step`` returned
+    :param i: Number of the copy
+    :param obs: Observations of the batch
+    :param step: Rewards, dones and infos of the batch
+    :param single: The single environment
+    """
     rewards, dones, infos = step
     single_obs, single_rewards, _, truncations, single_infos = e
     agents = single.possible_agents
@@ -146,7 +157,7 @@ def test_state_resumes_exactly():
 
     def play(target, draws):
         steps = [target.step(dict(zip(target.possible_agents, draw, strict=True))) for draw in draws]
-        # all but the wall-clock time of the monitoring
+        # All but the wall-clock time that the monitor writes
         return pickle.dumps(
             [(o, r, d, [{**i, "episode": i.get("episode", {}).get("r")} for i in infos]) for o, r, d, infos in steps]
         )
