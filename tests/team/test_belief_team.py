@@ -1,4 +1,4 @@
-"""A team of BeliefPPO agents at the junction: what the rooms promise holds for them together."""
+"""A team of BeliefPPO agents at the junction: learning, determinism, saving and rewards, all parts together."""
 
 from typing import Any
 
@@ -13,11 +13,13 @@ SMALL: dict[str, Any] = dict(n_steps=20, batch_size=80, n_epochs=2, history_leng
 
 
 def make_team(belief="dynamic", seed=0, **env_kwargs):
+    """Return a small team in four copies of the easy junction."""
     env = make_team_env("traffic-junction-easy", n_envs=4, seed=seed, env_kwargs=env_kwargs)
     return Team(BeliefPPO, "BeliefPolicy", env, seed=seed, belief=belief, **SMALL)
 
 
 def parameters(team):
+    """Return copies of all tensors of all agents' policies by name."""
     return {
         f"{agent}.{name}": value.clone()
         for agent, model in team.agents.items()
@@ -31,12 +33,12 @@ def test_every_agent_learns_a_belief_of_its_own():
         assert list(model.others_action_spaces) == [name for name in team.possible_agents if name != agent]
         logged = model.logger.name_to_value
         assert logged["belief/first_log_ratio"] < 1e-5
-        # What was stored is what was visible of those who were in play
+        # The buffer holds the actions that were visible, of agents that were in play
         buffer = model.rollout_buffer
         blocks = buffer.others_actions.reshape(-1, 4, 2)
         np.testing.assert_array_equal(blocks.sum(axis=2), buffer.others_visible.astype(np.float32))
         assert not buffer.others_visible[~buffer.active].any()
-        # Slot occupancy is the first component of the observation: the history has no step without a car
+        # The first entry of an observation says whether the slot has a car. The history holds only such steps
         history = filled_rows(model.policy.history)
         assert len(history.valid) > 0 and (history.observations[:, 0] == 1).all()
     first, second = (team.agents[agent].policy.belief.query.weight for agent in ("car_0", "car_1"))
@@ -70,7 +72,7 @@ def test_with_the_team_reward_idle_slots_pass_it_on_to_those_who_earned_it():
     team.learn(80)
     for model in team.agents.values():
         buffer = model.rollout_buffer
-        values = buffer.values.reshape(4, 20).T  # the update has put each copy's steps one after the other
+        values = buffer.values.reshape(4, 20).T  # After the update each copy's steps stand one after the other
         active, rewards = buffer.active.reshape(4, 20).T, buffer.rewards
         for copy in range(4):
             for step in range(18):

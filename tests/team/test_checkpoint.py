@@ -1,4 +1,4 @@
-"""The file of a team, and the agents' own zips in it."""
+"""The file of a team, and the agents' SB3 zips within it."""
 
 import io
 import json
@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def trained(n_envs=2, **kwargs):
+    """Return a team of PPO agents after 32 timesteps."""
     team = Team(PPO, "MlpPolicy", make_team_env(ToyEnv, n_envs=n_envs), **{"seed": 0, **PPO_KWARGS, **kwargs})
     return team.learn(32)
 
@@ -37,7 +38,7 @@ def test_an_agents_zip_loads_alone_in_a_fresh_process(tmp_path):
         archive.extract("agents/agent_1.zip", tmp_path)
     obs = np.random.default_rng(0).normal(size=(20, 2)).astype(np.float32)
     np.save(tmp_path / "obs.npy", obs)
-    # nothing of this package is imported there
+    # The script imports nothing of this package
     script = """
 import sys
 import numpy as np
@@ -111,7 +112,7 @@ def test_an_agents_statistics_load_alone(tmp_path):
 
 
 class SoloEnv(gym.Env):
-    """An environment of one agent, for its spaces."""
+    """Gymnasium environment that has nothing but the spaces of one agent."""
 
     def __init__(self, observation_space, action_space):
         self.observation_space, self.action_space = observation_space, action_space
@@ -148,7 +149,7 @@ def test_an_environment_that_does_not_fit(tmp_path):
 
 
 def rewrite(path, change):
-    """Write a saved team's file anew with another manifest."""
+    """Rewrite a saved team's file with a changed manifest."""
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     manifest = json.loads(parts["team.json"])
@@ -194,7 +195,7 @@ def test_files_that_are_no_team(tmp_path):
 
 
 def test_no_environment_in_the_file(tmp_path):
-    """Neither the hub nor a callback of a user's ends up in an agent's zip."""
+    """An agent's zip holds neither the environment, nor the loop of the team, nor a user's callback."""
     team = Team(PPO, "MlpPolicy", make_team_env(partial(ToyEnv, limit=3)), seed=0, **PPO_KWARGS)
     team.learn(8)
     team.save(tmp_path / "team")

@@ -1,4 +1,4 @@
-"""Whatever goes wrong: nothing hangs, nothing that was learned or saved is lost, and it is said what happened."""
+"""Whatever fails while a team learns: nothing hangs, nothing learned or saved is lost, and the error says what happened."""
 
 import os
 import signal
@@ -18,23 +18,25 @@ from tests.team.toy_envs import FaultyEnv, ToyEnv
 
 @pytest.fixture(autouse=True)
 def ctrl_c_interrupts():
-    """Also where the tests run in the background, where a shell lets Ctrl-C be ignored."""
+    """Let Ctrl-C interrupt also where the tests run in the background, since a shell has it ignored there."""
     old = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, old)
 
 
 def make_team(env=None, n_agents=3, **kwargs):
+    """Return a team of PPO agents, by default in two copies of a ``ToyEnv``."""
     env = env or make_team_env(partial(ToyEnv, n_agents=n_agents), n_envs=2)
     return Team(PPO, "MlpPolicy", env, seed=0, **{**PPO_KWARGS, **kwargs})
 
 
 def notes(error):
+    """Return the notes that were added to an error."""
     return " ".join(getattr(error, "__notes__", []))
 
 
 def works_again(team, tmp_path):
-    """Saving and learning go on as if nothing had been."""
+    """Assert that the team saves and learns as if nothing had happened."""
     team.save(tmp_path / "after")
     before = {agent: parameters(model) for agent, model in team.agents.items()}
     team.learn(32)
@@ -46,10 +48,10 @@ def works_again(team, tmp_path):
 
 class Raises(BaseCallback):
     """
-    Raises or sends Ctrl-C at a step.
+    Callback that raises an error, or sends Ctrl-C, at a given step.
 
-    :param at: count of calls
-    :param error: what to raise; None: Ctrl-C
+    :param at: Number of the step, from 1
+    :param error: The error. None for Ctrl-C
     """
 
     def __init__(self, at, error=None):
@@ -65,7 +67,7 @@ class Raises(BaseCallback):
 
 
 class Cleans(PPO):
-    """Notes whether its ``finally`` blocks run."""
+    """PPO that counts how often its ``finally`` block has run."""
 
     cleaned = 0
 
@@ -100,9 +102,9 @@ def test_a_callback_stops_all_after_this_step(who, tmp_path):
     assert {name: record.steps for name, record in records.items()} == dict.fromkeys(records, 11)
     assert all(record.events[-1] == "training end" for record in records.values())
     assert team.num_timesteps == 22 and {model.num_timesteps for model in team.agents.values()} == {22}
-    # the environment made no further step: two copies, episodes of 7
+    # The environment made no further step: 11 steps are an episode of 7 and 4 steps of the next, in both copies
     assert team.get_env().get_attr("t") == [4, 4]
-    # SB3 drops the step at which a callback stops, so going on means new episodes
+    # SB3 drops the step at which a callback stops, so further learning begins with new episodes
     record = Record(keep=("dones",))
     team.learn(32, reset_num_timesteps=False, callback=record)
     assert team.num_timesteps == 22 + 32
@@ -130,7 +132,7 @@ def test_ctrl_c(who, vec_env, tmp_path):
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_ctrl_c_while_workers_step(tmp_path):
-    """The results under way do not come back as those of a later step."""
+    """After Ctrl-C, results that the workers were still computing are not taken for those of a later step."""
     env = make_team_env(ToyEnv, n_envs=2, vec_env="subproc")
     team = make_team(env)
     await_steps, calls = env.venv._await_steps, []
@@ -144,7 +146,7 @@ def test_ctrl_c_while_workers_step(tmp_path):
     env.venv._await_steps = interrupted
     with pytest.raises(KeyboardInterrupt):
         team.learn(64)
-    # an interruption means new episodes, even where the counts go on
+    # After an interruption new episodes begin, even if the number of steps is continued
     record = Record(keep=("infos", "dones"))
     team.learn(32, reset_num_timesteps=False, callback=record)
     assert [int(kept["dones"][0]) for kept in record.kept[:14]] == ([0] * 6 + [1]) * 2
@@ -165,7 +167,7 @@ def test_the_environment_fails(vec_env, tmp_path):
     else:
         assert "worker process 0 (exit code 1)" in str(caught.value)
         assert not any(process.is_alive() for process in env.venv.processes)
-    # episodes of 7, and the third step of the second one
+    # It fails at the third step of the second episode, and the first has 7 steps
     assert "joint step 10" in notes(caught.value) and team.num_timesteps == 18
     team.set_env(make_team_env(ToyEnv, n_envs=2))
     works_again(team, tmp_path)
@@ -247,7 +249,7 @@ def test_an_algorithm_that_resets_is_refused():
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_an_agent_that_will_not_stop():
-    """An agent that goes on acting when it is stopped is told so, and the first error is the one that is raised."""
+    """An agent that acts while it is being stopped gets an error, and the error that is raised remains the first one."""
 
     class Clings(PPO):
         def collect_rollouts(self, env, *args, **kwargs):

@@ -1,4 +1,4 @@
-"""One table per iteration for the team, and each agent's own series in files."""
+"""A team prints one table per iteration, and writes each agent's own values to files."""
 
 import csv
 
@@ -13,6 +13,7 @@ from tests.team.toy_envs import ScriptedEnv, ToyEnv
 
 
 def rows(path):
+    """Return the rows of a CSV file."""
     with open(path) as file:
         return list(csv.DictReader(file))
 
@@ -36,12 +37,12 @@ def test_means_and_spread(tmp_path):
     for i, row in enumerate(table):
         assert float(row["time/total_timesteps"]) == 16 * (i + 1) and int(row["time/iterations"]) == i + 1
         returns = [float(series[i]["rollout/ep_rew_mean"]) for series in own.values()]
-        # agents' own returns are 8 * (1 + 10 k + step / 100), the team's is their mean
+        # Agent k's return is the sum of 1 + 10 k + step / 100 over 8 steps, the team's is the mean over agents
         assert returns == pytest.approx([8 * (1 + 10 * k) + 0.36 for k in range(4)], rel=1e-5)
         assert float(row["rollout/ep_rew_mean"]) == pytest.approx(np.mean(returns))
         assert float(row["rollout/ep_rew_mean_std"]) == pytest.approx(np.std(returns))
         assert float(row["rollout/ep_len_mean"]) == 8
-        # episodes 1, 2, 3 of both copies: only even ones succeed
+        # Of the episodes 1, 2 and 3 of both copies only the second succeeds
         assert float(row["rollout/success_rate"]) == pytest.approx([0, 1 / 2, 1 / 3][i])
         if i > 0:
             for key in ("train/approx_kl", "train/value_loss"):
@@ -74,7 +75,7 @@ def test_belief_values_have_a_spread(tmp_path):
 
 
 def test_agents_that_log_at_different_times(tmp_path):
-    """A table as soon as there is something new of everyone who learns."""
+    """A table is printed as soon as every agent that learns has logged something new."""
     own_kwargs = {"agent_0": {"n_steps": 8, "batch_size": 8}, "agent_1": {"learning_starts": 4, "train_freq": 1}}
     env = make_team_env(ToyEnv)
     team = Team({"agent_0": PPO, "agent_1": DQN}, "MlpPolicy", env, seed=0, agent_kwargs=own_kwargs, log_dir=str(tmp_path))

@@ -1,4 +1,4 @@
-"""Team as SB3's model protocol has it: construction, prediction, evaluation, callbacks, normalisation."""
+"""Team follows SB3's model protocol: construction, prediction, evaluation, callbacks and normalisation."""
 
 from functools import partial
 
@@ -25,6 +25,7 @@ from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv
 
 
 def make_team(n_envs=2, env=None, **kwargs):
+    """Return a team of PPO agents, by default in copies of a ``ToyEnv``."""
     return Team(PPO, "MlpPolicy", env or make_team_env(ToyEnv, n_envs=n_envs), **{"seed": 0, **PPO_KWARGS, **kwargs})
 
 
@@ -35,7 +36,7 @@ def test_seeds():
     assert th.equal(parameters(team.agents["agent_1"]), parameters(same.agents["agent_1"]))
     assert not th.equal(parameters(team.agents["agent_1"]), parameters(team.agents["agent_0"]))
     assert not th.equal(parameters(team.agents["agent_1"]), parameters(other.agents["agent_1"]))
-    # the environment is seeded with the team's own, copy by copy
+    # The environment is given the team's seed
     env = make_team_env(ToyEnv, n_envs=2, seed=0)
     assert np.array_equal(team.get_env().reset()["agent_1"], env.reset()["agent_1"])
     unseeded = [make_team(seed=None) for _ in range(2)]
@@ -101,7 +102,7 @@ def test_evaluate_policy():
     team = make_team()
     rewards, lengths = evaluate_policy(team, make_team_env(ToyEnv, n_envs=3, seed=0), 6, return_episode_rewards=True)
     assert lengths == [7] * 6 and np.isfinite(rewards).all()
-    # as SB3's own evaluation of its models: VecMonitor counts the same
+    # SB3's VecMonitor counts the same returns as the built-in monitor
     mean, _ = evaluate_policy(team, make_team_env(ToyEnv, n_envs=3, seed=0), 6)
     monitored, _ = evaluate_policy(team, VecMonitor(make_team_env(ToyEnv, n_envs=3, seed=0)), 6)
     assert mean == pytest.approx(np.mean(rewards)) and mean == pytest.approx(monitored, rel=1e-5)
@@ -122,7 +123,7 @@ def test_eval_checkpoint_and_threshold_callbacks(tmp_path):
     checkpoint = CheckpointCallback(save_freq=4, save_path=str(tmp_path / "checkpoints"), name_prefix="team")
     record = Record()
     team.learn(1000, callback=[checkpoint, evaluate, record])
-    # the first evaluation, at the 10th step, is above the threshold
+    # The first evaluation, at the 10th step, is above the threshold
     assert record.steps == 10 and team.num_timesteps == 20
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["team_16_steps.zip", "team_8_steps.zip"]
@@ -169,9 +170,9 @@ def test_normalisation_is_each_agents_own():
     statistics = {agent: model.get_vec_normalize_env() for agent, model in team.agents.items()}
     assert all(s.clip_obs == 3.0 and s.gamma == 0.5 for s in statistics.values())
     assert len({s.obs_rms.mean[0] for s in statistics.values()}) == 3  # "stays" and "last" observe the same
-    assert statistics["last"].obs_rms.mean[0] == pytest.approx(3.5, abs=0.2)  # steps 0 to 7
+    assert statistics["last"].obs_rms.mean[0] == pytest.approx(3.5, abs=0.2)  # The mean of the steps 0 to 7
     assert len({float(s.ret_rms.var) for s in statistics.values()}) == 4
-    # predictions use them and leave them
+    # Predictions use the statistics without updating them
     obs = env.reset()
     before = {agent: s.obs_rms.mean.copy() for agent, s in statistics.items()}
     actions, _ = team.predict(obs, deterministic=True)

@@ -1,4 +1,4 @@
-"""What each agent is given of a joint step."""
+"""What each agent gets of a joint step."""
 
 import time
 
@@ -15,6 +15,7 @@ AGENTS = ["zeta", "box", "multi", "binary"]
 
 
 def sample(env, rng_seed):
+    """Return random joint actions, ``[num_envs, ...]`` by agent."""
     for i, agent in enumerate(AGENTS):
         env.action_space[agent].seed(rng_seed + i)
     return {agent: np.array([env.action_space[agent].sample() for _ in range(env.num_envs)]) for agent in AGENTS}
@@ -92,7 +93,7 @@ def test_who_ends_when():
     assert ends["cut"][6]["terminal_observation"].tolist() == [6, 10]
     assert cut[5][0].tolist() == [[0, 0]]
     assert ends["last"][8]["terminal_observation"].tolist() == [8, 10]
-    # its own return, over the team's whole episode, and only at its end
+    # "episode" holds the agent's own return over the team's whole episode, and appears only at its end
     assert ["episode" in step[3][0] for step in dies] == [False] * 7 + [True]
     assert dies[-1][3][0]["episode"]["r"] == pytest.approx(sum(11 + t / 100 for t in range(1, 9)), rel=1e-6)
     assert dies[-1][3][0]["episode"]["l"] == 8 and dies[-1][3][0]["is_success"] is False
@@ -139,7 +140,11 @@ def test_one_agent_has_no_others():
 
 
 def test_many_agents_stay_cheap():
-    """A guard against a loop over (agent, copy, other); benchmarks measure, so the bound is far off what is usual (0.2 ms)."""
+    """
+    Guard against a loop over agents, copies and others.
+
+    Measuring is left to the benchmarks, so the bound is ten times the usual 0.2 ms.
+    """
     n, e = 10, 32
     names = [f"a{i}" for i in range(n)]
     views = TransitionSplitter(names, {name: spaces.Discrete(2) for name in names})

@@ -1,4 +1,4 @@
-"""Scripted others: partners that belong to the environment. Each agent is told of them as of its teammates."""
+"""Scripted others are partners that belong to the environment. Each agent sees their actions as it sees its teammates'."""
 
 from functools import partial
 from typing import Any, ClassVar
@@ -29,7 +29,9 @@ BELIEF: dict[str, Any] = {
 
 def play(env, n_steps, seed=0):
     """
-    :return: for each step the joint actions, the joint step and the agents' parts of it
+    Play random actions.
+
+    :return: The loop, and for each step the joint actions, the joint step and the agents' transitions
     """
     scheduler = JointLoop(env)
     env.reset()
@@ -73,7 +75,7 @@ def test_agents_are_told_what_they_could_see(env_class, vec_env):
                 expected = [x if is_seen else 0.0 for part, is_seen in zip(parts, seen, strict=True) for x in part]
                 assert info["others_actions"].dtype == np.float32
                 assert info["others_actions"].tolist() == expected
-    # the last step of an episode is told as it was, not as it is after the reset
+    # At the last step of an episode the actions are those of that step, not those after the reset
     assert record[5][1][2].all() and record[5][1][3][0]["scripted_actions"].tolist() == [6, -1, 0, 1, 0, 0]
     env.close()
 
@@ -126,7 +128,13 @@ def test_without_scripted_others_nothing_is_said_of_them(env_class):
 
 
 class Changed(PartneredEnv):
-    """Tells something else."""
+    """
+    A ``PartneredEnv`` with other scripted actions, spaces or visibility.
+
+    :param told: Scripted actions that replace those of the class
+    :param scripted_spaces: ``scripted_action_spaces``. None for those of the class
+    :param rows: What ``visibility()`` returns. None for no ``visibility()``
+    """
 
     def __init__(self, told=None, scripted_spaces=None, rows=None):
         super().__init__()
@@ -167,7 +175,7 @@ def test_actions_of_every_kind_of_space():
     env = make_team_env(Kinds, env_kwargs={"scripted_spaces": kinds})
     env.reset()
     actions = {"arrow": [0], "ball": [[0.0]]}
-    # one-hot for each dimension of a MultiDiscrete, numbers as they are for MultiBinary and Box, also out of bounds
+    # MultiDiscrete is one-hot for each dimension. MultiBinary and Box keep their numbers, also those out of bounds
     assert env.step(actions)[3][0]["scripted_actions"].tolist() == [0, 1, 1, 0, 0, 1, 0, 0.5, -1, 7, 0]
     for name, wrong in (("x", [2, 0]), ("x", [1]), ("y", [2, 0]), ("y", [1, 0, 0])):
         told = {**told, name: wrong}
@@ -230,9 +238,10 @@ def test_spaces_that_are_refused(scripted_spaces, says):
 
 class Batched(TeamVecEnv):
     """
-    One learner and a scripted other, written as a vectorised environment.
+    Vectorised environment of one learner and one scripted other.
 
-    :param info: what it says besides, or instead
+    :param info: Entries that replace those of the infos, None for entries to leave out
+    :param num_envs: Number of copies
     """
 
     def __init__(self, info, num_envs=2):
@@ -305,7 +314,7 @@ def test_a_team_learns_with_a_belief_about_them(normalize, wrap):
         assert list(model.others_action_spaces) == [other, "wind", "leader"]
         assert list(model.get_env().get_attr("others_action_spaces")[0]) == [other, "wind", "leader"]
         buffer = model.rollout_buffer
-        # after the update the copies' rows stand one after the other: the third rollout is the steps 1 to 6, twice
+        # After the update the rows of a copy stand one after the other. The third rollout is two episodes of 6 steps
         told = buffer.others_actions.reshape(2, 12, -1)[0]
         assert told.shape == (12, own_width + 2 + 4)
         assert buffer.others_visible.all()
@@ -330,7 +339,7 @@ def test_save_and_load(tmp_path, algo_class, policy):
     team = Team(algo_class, policy, make_team_env(PartneredEnv, n_envs=2), seed=0, **kwargs).learn(24)
     team.save(tmp_path / "team")
     obs = make_team_env(PartneredEnv).reset()
-    # also a team without an environment knows whom it has learned with
+    # A team that was loaded without an environment still saves which scripted others it has learned with
     Team.load(tmp_path / "team").save(tmp_path / "again")
     loaded = Team.load(tmp_path / "again", env=make_team_env(BlinkingEnv, n_envs=3))
     for agent, action in team.predict(obs, deterministic=True)[0].items():

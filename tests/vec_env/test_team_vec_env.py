@@ -1,4 +1,4 @@
-"""TeamVecEnv: infos, monitoring, checks, worker processes."""
+"""TeamVecEnv: infos, monitoring, checks and worker processes."""
 
 import csv
 import json
@@ -18,6 +18,7 @@ ZEROS = {agent: np.zeros(1, int) for agent in ("stays", "dies", "cut", "last")}
 
 
 def scripted_episode(**kwargs):
+    """Return a ``ScriptedEnv`` and the eight steps of its first episode."""
     env = make_team_env(ScriptedEnv, **kwargs)
     env.reset()
     return env, [env.step(ZEROS) for _ in range(8)]
@@ -30,12 +31,12 @@ def test_infos_of_every_way_to_end(vec_env):
     flags = {
         key: np.array([info[key] for info in infos]).T.astype(int).tolist() for key in ("active", "life_end", "truncated")
     }
-    # rows: stays, dies, cut, last; columns: the eight steps
+    # Rows are the agents stays, dies, cut and last, columns the eight steps
     assert flags["active"] == [[1, 1, 1, 0, 0, 1, 1, 1], [1] * 5 + [0] * 3, [1] * 6 + [0] * 2, [1] * 8]
     assert flags["life_end"] == [[0, 0, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0, 0], [0] * 8, [0] * 8]
     assert flags["truncated"] == [[0] * 7 + [1], [0] * 8, [0] * 5 + [1, 0, 0], [0] * 7 + [1]]
     assert [bool(step[2][0]) for step in steps] == [False] * 7 + [True]
-    # default visibility: both in play
+    # By default an action is visible if both agents are in play
     assert infos[3]["visible"].tolist() == [[False] * 3, [False, True, True], [False, True, True], [False, True, True]]
     for t, (info, step) in enumerate(zip(infos, steps, strict=True), start=1):
         expected = [1 + 10 * i + t / 100 for i in range(4)]
@@ -55,7 +56,7 @@ def test_infos_of_every_way_to_end(vec_env):
 
 def test_who_has_left_observes_zero():
     _, steps = scripted_episode()
-    # it leaves at the fifth step; what it saw then comes as its terminal observation, for a value at a time limit
+    # "dies" leaves at step 5. An agent that is cut off has its last observation in the infos, for the value at the limit
     assert [step[0]["dies"][0].tolist() for step in steps[3:7]] == [[4, 10], [0, 0], [0, 0], [0, 0]]
     assert steps[5][3][0]["terminal_observation"] == {"cut": pytest.approx(np.array([6, 10]))}
     assert [step[0]["last"][0, 0] for step in steps[4:7]] == [5, 6, 7]
@@ -89,13 +90,13 @@ def test_workers_equal_in_process():
         for info, info2 in zip(infos, infos2, strict=True):
             assert all(np.array_equal(info[key], info2[key]) for key in ("agent_rewards", "visible", "active", "truncated"))
     assert runs[0][25][2].all() and runs[0][25][3][0]["TimeLimit.truncated"]
-    # copy i has the seed 5 + i
+    # Copy i has the seed 5 + i
     env = make_team_env(simple_spread_v3.parallel_env, n_envs=1, seed=6)
     assert np.array_equal(env.reset()["agent_1"][0], runs[0][0][0]["agent_1"][1])
 
 
 class Sensitive(MixedEnv):
-    """Rewards the exact number, type and kind of the action."""
+    """A ``MixedEnv`` whose rewards depend on the value, the dtype and the Python type of the action."""
 
     def step(self, actions):
         obs, _, *rest = super().step(actions)
@@ -106,7 +107,7 @@ class Sensitive(MixedEnv):
 
 
 def same(one, other):
-    """To the last bit, keys and types included."""
+    """Assert that two results are equal to the bit, including keys and types."""
     if isinstance(one, dict):
         assert one.keys() == other.keys()
         for key in one.keys() - {"t"}:
@@ -127,7 +128,7 @@ def test_what_workers_send_equals_what_copies_here_return(env_class):
             space.seed(int(rng.integers(1000)))
             actions[agent] = np.array([space.sample() for _ in range(3)])
             if isinstance(space, spaces.Box):
-                # Not the space's own type
+                # A dtype other than the space's
                 actions[agent] = np.float64(0.999) * actions[agent]
         for agent, mask in (here.action_masks() or {}).items():
             actions[agent] = mask.argmax(axis=1)
@@ -137,7 +138,7 @@ def test_what_workers_send_equals_what_copies_here_return(env_class):
             same(info, info2)
         if (masks := here.action_masks()) is not None:
             same(masks, there.action_masks())
-    # What was handed out stays as it is, and may be written to
+    # Arrays that a step has returned do not change later, and may be written to
     kept = [array.copy() for array in obs2.values()]
     there.step(actions)
     assert all(np.array_equal(array, copy) for array, copy in zip(obs2.values(), kept, strict=True))
@@ -200,7 +201,7 @@ def test_masks_are_those_of_the_current_observation(vec_env):
 
 
 def monitor_rows(path):
-    """As SB3's ``load_results`` reads a file, which needs pandas."""
+    """Return the rows of a monitor file, as SB3's ``load_results`` does, which needs pandas."""
     with open(path) as file:
         assert "t_start" in json.loads(file.readline()[1:])
         return list(csv.DictReader(file))
@@ -267,6 +268,8 @@ def test_wrong_actions(actions, says):
 
 
 class SpaceEnv(ToyEnv):
+    """A ``ToyEnv`` with other spaces."""
+
     def __init__(self, observation_space=None, action_space=None):
         super().__init__()
         self.given = observation_space, action_space
@@ -336,7 +339,7 @@ def test_order_is_the_environments_not_the_alphabets():
     actions = {"zeta": [2], "box": [[0.5, -1]], "multi": [[1, 2]], "binary": [[1, 1]]}
     _, _, _, infos = env.step(actions)
     assert infos[0]["agent_rewards"].tolist() == [2.0, -0.5, 3.0, 2.0]
-    # step 1: i sees j where i + j is odd
+    # At step 1 agent i sees agent j where i + j is odd
     expected = [[True, False, True], [True, True, False], [False, True, True], [True, False, True]]
     assert infos[0]["visible"].tolist() == expected
 

@@ -1,4 +1,4 @@
-"""What an environment or an actor gets wrong while it runs is said with agent, environment copy and step."""
+"""Errors of an environment or of whoever acts in it are reported with the agent, the environment copy and the step."""
 
 from functools import partial
 from typing import Any
@@ -15,9 +15,11 @@ ACTIONS: dict[str, Any] = {f"agent_{i}": np.zeros(2, int) for i in range(3)}
 
 class Faulty(ToyEnv):
     """
-    A ``ToyEnv`` of three agents whose second copy has one fault, at step 3 of its second episode (or at the reset before).
+    A ``ToyEnv`` of three agents, of which every second copy has one fault.
 
-    :param fault: name of the method that makes it
+    The fault occurs at step 3 of the second episode, or at the reset before it where its name begins with ``reset_``.
+
+    :param fault: Name of the method that makes the fault
     """
 
     made = 0
@@ -108,6 +110,7 @@ class Faulty(ToyEnv):
 
 
 def run(env):
+    """Reset, and make nine steps: two episodes and the first step of the third."""
     env.reset()
     for _ in range(9):
         env.step(ACTIONS)
@@ -151,7 +154,7 @@ def test_without_a_fault_it_runs():
 
 
 def test_numbers_are_looked_at_in_worker_processes_too():
-    # a worker counts the environments it has made itself: both copies are the first one there
+    # Faulty would not do here: it counts the environments of its own process, and each worker makes only one
     env = make_team_env(partial(AlwaysNaN, 2), n_envs=2, vec_env="subproc")
     env.reset()
     env.step(ACTIONS)
@@ -161,7 +164,11 @@ def test_numbers_are_looked_at_in_worker_processes_too():
 
 
 class AlwaysNaN(ToyEnv):
-    """:param at: step at which an observation is not a number"""
+    """
+    A ``ToyEnv`` of three agents, one of which observes NaN at a given step.
+
+    :param at: The step
+    """
 
     def __init__(self, at):
         super().__init__(n_agents=3)
@@ -214,7 +221,7 @@ def test_actions_outside_of_their_space(agent, actions, said):
         env.step({**MIXED, agent: np.array(actions)})
     expected = f"The action of {agent!r} in environment copy {copy} at step 3 is {said}, which is not in its action space"
     assert str(error.value).startswith(expected)
-    # nothing was stepped
+    # No copy has been stepped
     assert env.get_attr("t") == [2, 2]
 
 
@@ -225,7 +232,11 @@ def test_what_rescaling_rounds_is_in_the_space():
 
 
 class NoWay(MaskedEnv):
-    """:param at: step after which agent_1 can do nothing"""
+    """
+    A ``MaskedEnv`` whose mask of ``agent_1`` allows no action after a given step.
+
+    :param at: The step, 0 for the reset
+    """
 
     def __init__(self, at):
         super().__init__(n_agents=3, limit=5)
@@ -287,11 +298,11 @@ def test_copies_that_differ():
         make_team_env(lambda: one, n_envs=2)
 
 
-# Visibility as the user says
+# Visibility given by the user
 
 
 def looks_left(env):
-    """Each sees who comes before it in the list, from the second step on."""
+    """Return a visibility with which each agent sees those before it in the list, from the second step on."""
     agents = env.possible_agents
     return {agent: np.array([env.t > 1 and j < i for j in range(len(agents)) if j != i]) for i, agent in enumerate(agents)}
 
@@ -301,7 +312,7 @@ def test_the_user_says_who_is_visible(vec_env):
     env = make_team_env(partial(ToyEnv, n_agents=3, limit=2), n_envs=2, vec_env=vec_env, visibility=looks_left)
     env.reset()
     assert not env.step(ACTIONS)[3][1]["visible"].any()
-    # the last step of an episode included
+    # The last step of an episode is included
     _, _, dones, infos = env.step(ACTIONS)
     assert dones.all()
     assert infos[1]["visible"].tolist() == [[False, False], [True, False], [True, True]]

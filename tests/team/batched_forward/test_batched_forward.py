@@ -1,4 +1,4 @@
-"""Agents with equal networks act together, and learn, draw and log the same as when each acts alone, bit for bit."""
+"""Agents with equal networks act in one batched pass, and learn, draw and log the same to the bit as when each acts alone."""
 
 from typing import Any
 
@@ -25,9 +25,7 @@ PPO_KWARGS: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "n_epochs": 2}
 
 @pytest.fixture
 def sizes(monkeypatch):
-    """
-    :return: of how many agents the passes were that have been made together
-    """
+    """Return a list that collects the number of agents of each batched pass."""
     found: list[int] = []
     call = batcher.StackedNetworks.__call__
 
@@ -36,12 +34,14 @@ def sizes(monkeypatch):
         return call(self, flat, noise)
 
     monkeypatch.setattr(batcher.StackedNetworks, "__call__", count)
-    # Without those that only try out whether they agree
+    # Without the passes that only test whether batched and single passes agree
     monkeypatch.setattr(batcher, "_agrees", Agrees())
     return found
 
 
 class Agrees(dict):
+    """Record of tested signatures that claims that all of them agree."""
+
     def __contains__(self, key):
         return True
 
@@ -51,7 +51,9 @@ class Agrees(dict):
 
 def learn_both_ways(monkeypatch, sizes, n_rollouts=3, callback=None, **kwargs):
     """
-    :return: of how many agents the passes were that have been made together, when agents act as they do
+    Train a team without and with batched passes, and assert that the results are equal.
+
+    :return: The number of agents of each batched pass
     """
     results = []
     for alone in (True, False):
@@ -97,7 +99,7 @@ def test_the_same_is_learned(case, monkeypatch, sizes):
     found = learn_both_ways(monkeypatch, sizes, **SAME[case])
     n_agents, n_steps = 5 if SAME[case].get("env_id") == EASY else 3, SAME[case].get("n_steps", 8)
     if SAME[case].get("belief", "dynamic") in ("dynamic", "context") and "history_length" in SAME[case]:
-        # While histories grow, agents may remember different numbers of steps
+        # While their histories grow, agents may hold different numbers of steps, and then are not batched
         assert found[:n_steps] == [n_agents] * n_steps and sum(found[n_steps:]) > 2 * n_agents * n_steps / 2
     else:
         assert found == [n_agents] * n_steps * 3
@@ -106,14 +108,14 @@ def test_the_same_is_learned(case, monkeypatch, sizes):
 def test_the_policies_that_act_together_are_the_ones_that_agree(monkeypatch, sizes):
     monkeypatch.setattr(batcher, "_agrees", {})
     found = learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]})
-    # Tried out once
+    # One pass of the 25 is the test whether they agree
     assert found == [3] * 25
-    # So small that their products are rounded in another way together than alone
+    # These layers are so small that batched products are rounded differently, so that the test is the only pass
     assert learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [3, 1]}) == [3]
 
 
 class Hooked(BaseCallback):
-    """A team's callback that adds a hook to an agent's network, within a rollout."""
+    """Callback of the team that adds a hook to an agent's network in the middle of a rollout."""
 
     model: Any
 
@@ -124,7 +126,7 @@ class Hooked(BaseCallback):
 
 
 class Writes(BaseCallback):
-    """A team's callback that changes agents within rollouts, in all ways there are."""
+    """Callback of the team that changes agents' weights in the middle of rollouts, in five different ways."""
 
     model: Any
 
@@ -151,7 +153,7 @@ def test_weights_that_are_changed_within_a_rollout_count_at_once(kwargs, monkeyp
 
 
 class MyPolicy(ActorCriticPolicy):
-    """One of one's own."""
+    """A user's own policy class."""
 
 
 OWN: dict[str, dict[str, Any]] = {
@@ -173,7 +175,7 @@ def test_those_of_one_kind_act_together(monkeypatch, sizes):
     assert learn_both_ways(monkeypatch, sizes, agent_kwargs=shape) == [2] * 24
     two = {f"agent_{i}": {"policy_kwargs": {"net_arch": [64]}} for i in (1, 3)}
     assert learn_both_ways(monkeypatch, sizes, env_id=lambda: ToyEnv(4), agent_kwargs=two) == [2] * 48
-    # From the rollout after that in which it gets the hook
+    # The agent acts alone from the rollout after the one in which it gets the hook
     assert learn_both_ways(monkeypatch, sizes, callback=Hooked) == [3] * 16 + [2] * 8
 
 

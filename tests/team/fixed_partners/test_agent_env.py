@@ -1,4 +1,4 @@
-"""One learner among fixed partners: it must meet what it meets in a Team."""
+"""One learner among fixed partners gets the same observations, rewards, dones and infos as in a Team."""
 
 from functools import partial
 from typing import Any
@@ -19,9 +19,9 @@ from tests.team.toy_envs import BlinkingEnv, MixedEnv, ScriptedEnv, ToyEnv
 
 class Playback:
     """
-    A partner that does what it is told beforehand.
+    Partner whose actions are given in advance.
 
-    :param actions: one a step
+    :param actions: One action for each step
     """
 
     def __init__(self, actions):
@@ -32,13 +32,12 @@ class Playback:
 
 
 def spread():
+    """Make a ``simple_spread`` of three agents and seven steps."""
     return simple_spread_v3.parallel_env(N=3, max_cycles=7)
 
 
 def sampled(env, n_steps, seed=5):
-    """
-    :return: {agent: actions of one copy of a team's environment, one a step}
-    """
+    """Return random actions by agent for one copy of a team's environment, one for each step."""
     rng = np.random.default_rng(seed)
     actions: dict[str, list] = {}
     for agent in env.possible_agents:
@@ -49,9 +48,7 @@ def sampled(env, n_steps, seed=5):
 
 
 def team_steps(make, agent, actions, n_steps):
-    """
-    :return: what the agent is given in a team: its first observation, and its parts of the steps
-    """
+    """Return the first observation and the transitions that the agent gets in a team."""
     env = make_team_env(make, n_envs=1, seed=11)
     scheduler = JointLoop(env)
     first = env.reset()[agent]
@@ -96,9 +93,9 @@ def test_the_learner_meets_what_it_meets_in_a_team(make, agent):
         assert found_rewards.dtype == rewards.dtype and np.array_equal(found_rewards, rewards)
         assert np.array_equal(found_dones, dones)
         info, found = dict(infos[0]), found_infos[0]
-        # a Monitor writes it, which counts what the learner has had since a reset
+        # A Monitor writes the entry here, and counts from the learner's last reset
         info.pop("episode", None)
-        # SB3's vectorisers say so at every step
+        # SB3's vectorised environments set the entry at every step
         info.setdefault("TimeLimit.truncated", False)
         assert found.keys() == info.keys()
         for key, value in info.items():
@@ -106,14 +103,14 @@ def test_the_learner_meets_what_it_meets_in_a_team(make, agent):
         for key in ("others_actions", "others_visible"):
             assert found[key].dtype == info[key].dtype and found[key].shape == info[key].shape
         n_dones, n_cut = n_dones + int(dones[0]), n_cut + int(info["TimeLimit.truncated"])
-    # MixedEnv terminates, all others end by their limits
+    # MixedEnv terminates, all others are truncated
     assert n_dones >= 4 and (n_cut > 0) == (make is not MixedEnv)
     env.close()
 
 
 @pytest.mark.parametrize("agent, last, cut", [("dies", 5, False), ("cut", 6, True)])
 def test_a_learner_that_has_left_does_not_wait_for_the_others(agent, last, cut):
-    """Steps and ends are as in a Team up to where it leaves; of the rest of the episode it hears only how it ended."""
+    """Up to where it leaves its steps are as in a Team. Of the rest of the episode it gets only whether it succeeded."""
     n_steps = 3 * 8
     template = make_team_env(ScriptedEnv, n_envs=1)
     actions = sampled(template, n_steps)
@@ -155,7 +152,7 @@ def test_after_its_own_end_reset_goes_on_unless_it_is_told_otherwise():
     assert terminated
     assert env.reset()[0].tolist() == [3, 10]
     assert env.step(0)[0].tolist() == [4, 10]
-    # in the midst of an episode, and with a seed or options, a reset is one
+    # In the middle of an episode, or with a seed or options, reset() begins a new episode
     assert env.reset()[0].tolist() == [0, 20]
     for _ in range(3):
         env.step(0)
@@ -165,7 +162,7 @@ def test_after_its_own_end_reset_goes_on_unless_it_is_told_otherwise():
     assert env.reset(options={"a": 1})[0].tolist() == [0, 40]
 
 
-@pytest.mark.filterwarnings("error")  # such as the one on the matrix that "binary" observes
+@pytest.mark.filterwarnings("error")  # Including the one that the matrix observation of "binary" causes
 @pytest.mark.parametrize("make, agent", [case.values for case in CASES if case.id != "mixed-binary"] + [(ScriptedEnv, "dies")])
 def test_sb3_finds_nothing_wrong_with_it(make, agent):
     spaces = make_team_env(make, n_envs=1).action_space

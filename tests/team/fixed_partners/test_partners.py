@@ -1,4 +1,4 @@
-"""Fixed partners: what can be one, and that each keeps to itself."""
+"""Fixed partners: what can be a partner, and that partners and learner do not influence each other."""
 
 import zipfile
 from functools import partial
@@ -27,7 +27,11 @@ BELIEF: dict[str, Any] = {
 
 
 class Counting:
-    """Has SB3's ``predict`` and a state, which it notes with the episode starts; it does the number of the step modulo 3."""
+    """
+    Partner with SB3's ``predict`` and a state, which counts the steps of an episode.
+
+    Its action is the number of the step modulo 3. It records each call: step, start of an episode, and ``deterministic``.
+    """
 
     def __init__(self):
         self.calls: list[tuple] = []
@@ -39,9 +43,7 @@ class Counting:
 
 
 def trained(path=None, algo=PPO, env=None, **kwargs):
-    """
-    :return: a team of two on the toy, a little trained
-    """
+    """Return a team that has learned for 64 timesteps, by default of two agents in a ``ToyEnv``, and save it if asked to."""
     env = make_team_env(toy(2), n_envs=2) if env is None else env
     team = Team(algo, "BeliefPolicy" if algo is BeliefPPO else "MlpPolicy", env, seed=3, **{**PPO_KWARGS, **kwargs})
     team.learn(64)
@@ -51,9 +53,7 @@ def trained(path=None, algo=PPO, env=None, **kwargs):
 
 
 def others_did(env, n_steps=20, seed=0):
-    """
-    :return: what the learner saw the others do
-    """
+    """Return the others' actions that the learner saw, flattened, one row for each step."""
     env.reset(seed=seed)
     seen = []
     for _ in range(n_steps):
@@ -72,7 +72,7 @@ def test_all_forms_of_a_model_act_alike(tmp_path):
     for did in [*found, others_did(AgentEnv(toy(2), "agent_0", tmp_path / "team.zip"))]:
         assert np.array_equal(did, expected)
     assert len(np.unique(expected, axis=0)) > 1
-    # and as the Team predicts, normalisation included
+    # The partner acts as the Team predicts, including normalisation
     env = AgentEnv(toy(2), "agent_0", {"agent_1": model}, deterministic=True)
     did = others_did(env, 6)
     reference = ToyEnv(2)
@@ -120,7 +120,7 @@ def test_partners_with_a_state_are_told_of_episodes():
 
 
 def test_masked_partners_get_their_masks():
-    """``MaskedEnv`` raises if anybody does what its mask forbids."""
+    """``MaskedEnv`` raises if an action is masked out."""
 
     def allowed(obs, action_masks):
         return int(np.flatnonzero(action_masks)[0])
@@ -136,7 +136,7 @@ def test_masked_partners_get_their_masks():
         for t in range(7):
             assert env.action_masks().dtype == bool and env.action_masks().tolist() == [k == t % 3 for k in range(3)]
             assert env.step(t % 3)[4]["others_actions"][:3].tolist() == [k == (t + 1) % 3 for k in range(3)]
-    # the last agent has none of its own
+    # The last agent of a MaskedEnv has no mask, so everything is allowed
     unmasked = AgentEnv(make, "agent_2", {"agent_0": allowed, "agent_1": allowed})
     unmasked.reset()
     assert unmasked.action_masks().all()
@@ -153,7 +153,7 @@ def test_a_masked_learner_and_a_masked_partner(tmp_path):
     env = DummyVecEnv([lambda: AgentEnv(make, "agent_0", tmp_path / "team.zip")] * 2)
     model = MaskableBeliefPPO("BeliefPolicy", env, seed=0, **BELIEF).learn(32)
     assert model.num_timesteps == 32
-    # a new environment, asked for its masks before its first reset
+    # A new environment, whose masks are asked for before its first reset
     env = AgentEnv(make, "agent_0", tmp_path / "team.zip")
     _, lengths = evaluate_masked(model, env, n_eval_episodes=2, return_episode_rewards=True, warn=False)
     assert lengths == [7, 7]
@@ -192,7 +192,7 @@ def test_partners_are_swapped_during_training(tmp_path, vec_env_cls):
 
 
 def test_the_learner_does_not_depend_on_its_partners_random_numbers():
-    """In the toy agents do not influence each other: whoever the partner is, the learner learns the same."""
+    """The agents of a ``ToyEnv`` do not influence each other, so the learner learns the same with any partner."""
 
     def noisy(obs):
         return np.random.randint(3)

@@ -1,4 +1,4 @@
-"""JointLoop: what the models learn from, determinism, random streams, the order of callbacks."""
+"""JointLoop: what the models learn from, determinism, random number generators, and the order of callbacks."""
 
 import random
 from functools import partial
@@ -22,6 +22,7 @@ from tests.team.toy_envs import MaskedEnv, MixedEnv, ScriptedEnv, ToyEnv, ToySol
 
 
 def learned(vec_env="dummy", seed=3):
+    """Return the parameters of three PPO agents after 64 timesteps of ``simple_spread``."""
     env = make_team_env(simple_spread_v3.parallel_env, n_envs=2, vec_env=vec_env, env_kwargs={"max_cycles": 5})
     team = Team(PPO, "MlpPolicy", env, seed=seed, **PPO_KWARGS)
     team.learn(64)
@@ -39,7 +40,7 @@ def test_three_ppos_on_simple_spread_are_deterministic_and_equal_with_workers():
 
 @pytest.mark.parametrize("algo, kwargs", [(PPO, PPO_KWARGS), (A2C, {"n_steps": 4}), (DQN, {"learning_starts": 10})])
 def test_an_agent_learns_what_it_would_learn_alone(algo, kwargs):
-    """Bit for bit, whatever its teammate is and however many random numbers that draws."""
+    """Its parameters are the same to the bit, whatever algorithm its teammate runs and however many numbers that draws."""
     seed, runs = 11, []
     for teammate, own in ((PPO, PPO_KWARGS), (A2C, {"n_steps": 3}), (DQN, {"learning_starts": 6})):
         env = make_team_env(ToyEnv, n_envs=2)
@@ -62,7 +63,7 @@ def test_the_callers_random_numbers_are_left_alone():
         return random.getstate(), str(np.random.get_state()), th.get_rng_state().tolist()
 
     env = make_team_env(ToyEnv)
-    np.random.normal()  # so that a second number is held back
+    np.random.normal()  # NumPy's generator then holds back a second number
     before = state()
     team = Team(PPO, "MlpPolicy", env, seed=0, **PPO_KWARGS)
     assert state() == before
@@ -71,7 +72,7 @@ def test_the_callers_random_numbers_are_left_alone():
 
 
 def test_streams_go_on_over_calls():
-    """A second ``learn`` does not repeat the first one's random numbers."""
+    """A second ``learn`` does not repeat the random numbers of the first."""
     env = make_team_env(ToyEnv)
     record = Record(keep=("actions",))
     team = Team(PPO, "MlpPolicy", env, seed=0, **{**PPO_KWARGS, "learning_rate": 0.0, "n_steps": 32})
@@ -86,12 +87,12 @@ def test_streams_go_on_over_calls():
     team.learn(32, callback=[record, Draw()], agent_callbacks={"agent_0": Draw()})
     actions = [kept["actions"]["agent_0"][0] for kept in record.kept]
     assert actions[:32] != actions[32:]
-    # neither does the team's callback repeat the agent's
+    # The team's callback does not repeat the agent's random numbers either
     assert len(set(draws)) == len(draws) == 128
 
 
 class Buffer(BaseCallback):
-    """Keeps the rollout as it is handed to training, with what SB3 had added up by then."""
+    """Callback that copies the rollout as training gets it, with bootstrapped rewards and advantages."""
 
     model: Any
 
@@ -105,7 +106,7 @@ class Buffer(BaseCallback):
         }
         with th.no_grad():
             self.last_value = self.model.policy.predict_values(th.as_tensor(self.model._last_obs)).item()
-            # V of the observation at a time limit, which never stands in the buffer
+            # Values of the observations at time limits, which are never in the buffer
             terminals = {t: np.array([[t, 10]], dtype=np.float32) for t in (6, 8)}
             self.terminal_values = {t: self.model.policy.predict_values(th.as_tensor(o)).item() for t, o in terminals.items()}
 
@@ -113,7 +114,7 @@ class Buffer(BaseCallback):
 @pytest.mark.parametrize(
     "agent, ends",
     [
-        # after which step an agent's return ends, and whether it was cut by a limit (then the value goes on)
+        # The step after which an agent's return ends, and whether a limit cut it off, so that the value is bootstrapped
         ("stays", {3: False, 8: True}),
         ("dies", {5: False, 8: False}),
         ("cut", {6: True, 8: False}),
@@ -129,11 +130,11 @@ def test_time_limits_bootstrap_and_life_ends_do_not(agent, ends):
 
     rewards = [1 + 10 * env.possible_agents.index(agent) + (t % 8 + 1) / 100 for t in range(n_steps)]
     values = buffer.copies["values"][:, 0]
-    # steps counted from 1; 12 steps are an episode of 8 and half of the next, in which everything repeats
+    # Steps count from 1. The 12 steps are an episode of 8 and half of the next, in which the same happens at the same steps
     ends = ends | {t + 8: cut for t, cut in ends.items() if t + 8 < n_steps}
     expected = np.zeros(n_steps)
     for t in range(n_steps):
-        # by definition: the sum of discounted TD errors until the return ends
+        # By definition, the advantage is the sum of discounted TD errors until the return ends
         weight = 1.0
         for k in range(t, n_steps):
             step = k + 1
@@ -164,7 +165,7 @@ def test_order_of_callbacks_and_counts():
 
     record, own = Record(), Record()
     team.learn(32, callback=[Counts(), record], agent_callbacks={"agent_1": own})
-    # SB3 runs callbacks when a step is counted and not yet in the buffer
+    # SB3 runs callbacks when a step has been counted but not yet added to the buffer
     assert seen == [(2 * t, {2 * t}, {(t - 1) % 8}, (2,)) for t in range(1, 17)]
     rollout = ["rollout start", *["step"] * 8, "rollout end"]
     assert record.events == ["training start", *rollout, *rollout, "training end"]
@@ -174,7 +175,7 @@ def test_order_of_callbacks_and_counts():
 
 @pytest.mark.parametrize("algo, kwargs", [(PPO, PPO_KWARGS), (DQN, {"learning_starts": 10})])
 def test_callbacks_do_not_change_what_is_learned(algo, kwargs):
-    """Without any callback the agents take a shorter way through a step."""
+    """Without callbacks a step takes a shorter path through the code, with the same results."""
     runs = []
     for team_callback, own in ((None, {}), (Record(), {}), (None, {"agent_1": Record()}), (Record(), {"agent_0": Record()})):
         team = Team(algo, "MlpPolicy", make_team_env(ToyEnv, n_envs=2), seed=0, **kwargs)
@@ -185,7 +186,7 @@ def test_callbacks_do_not_change_what_is_learned(algo, kwargs):
 
 
 def test_unequal_rollouts():
-    """Who has finished learning goes on acting, without learning, until the last one has finished."""
+    """An agent that has finished learning keeps acting, without learning, until the last one has finished."""
     env = make_team_env(ToyEnv)
     own_kwargs = {"agent_0": {"n_steps": 8}, "agent_1": {"n_steps": 20}}
     team = Team(PPO, "MlpPolicy", env, seed=0, agent_kwargs=own_kwargs, **{**PPO_KWARGS, "batch_size": 4})
@@ -206,16 +207,20 @@ def test_unequal_rollouts():
     assert th.equal(after["agent_0"], parameters(team.agents["agent_0"]))
     late = [int(kept["actions"]["agent_0"][0]) for kept in record.kept[32:]]
     assert len(set(late)) > 1
-    # agent_0 has not followed the last steps, so going on means new episodes for all
+    # agent_0 has not learned from the last steps, so further learning begins with new episodes for all agents
     again = Record(keep=("dones",))
     team.learn(20, reset_num_timesteps=False, callback=again)
     assert [int(kept["dones"][0]) for kept in again.kept[:14]] == ([0] * 6 + [1]) * 2
-    # the team's rollout is the longest one's
+    # The team's rollout ends with the longest rollout of an agent
     assert [record.events[:i].count("step") for i, event in enumerate(record.events) if event == "rollout end"] == [20, 40]
 
 
 def test_continue_where_it_was():
-    """Two calls with ``reset_num_timesteps=False`` are one call, but for what SB3 itself resets (here: nothing)."""
+    """
+    Two calls, the second with ``reset_num_timesteps=False``, equal one call.
+
+    The exception is what SB3 itself resets between calls, which is nothing here.
+    """
     runs = []
     for parts in ([48], [16, 32]):
         team = Team(PPO, "MlpPolicy", make_team_env(ToyEnv, n_envs=2), seed=0, **PPO_KWARGS)
@@ -251,7 +256,7 @@ def test_every_kind_of_space_and_algorithm_at_once():
     assert state["zeta"] is None and len(state["multi"]) == 2
     _, state2 = team.predict(obs, state, episode_start=np.zeros(2, bool), deterministic=True)
     assert not np.array_equal(state["multi"][0], state2["multi"][0])
-    # a row of a replay buffer is a joint step
+    # A row of a replay buffer is a joint step
     buffer = team.agents["zeta"].replay_buffer
     assert buffer.pos == 30 and buffer.dones[:5, 0].tolist() == [0, 0, 0, 0, 1]
 
@@ -270,7 +275,7 @@ def test_dying_agents_learn_on():
 def test_masks_reach_rollout_and_evaluation(algorithm, policy):
     make_env = partial(MaskedEnv, n_agents=3, limit=4)
     env, eval_env = make_team_env(make_env, n_envs=2), make_team_env(make_env, n_envs=3)
-    # MaskedEnv raises on an action that its mask forbids; agent_0 finishes first and acts on without learning
+    # MaskedEnv raises if an action is masked out. agent_0 finishes first and keeps acting without learning
     own_kwargs = {"agent_0": {"n_steps": 6, "batch_size": 4}}
     team = Team(algorithm, policy, env, seed=0, agent_kwargs=own_kwargs, **PPO_KWARGS)
     assert team.takes_masks
