@@ -12,7 +12,6 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief import AgentEnv, BeliefPPO
 
@@ -21,8 +20,7 @@ class Greeting(ParallelEnv):
     """Two agents see the same one of three cues for eight steps and earn 1 at each step at which their actions are equal."""
 
     def __init__(self) -> None:
-        self.possible_agents = ["guest", "host"]
-        self.rng = np.random.default_rng()
+        self.possible_agents, self.rng = ["guest", "host"], np.random.default_rng()
 
     def observation_space(self, agent: str) -> spaces.Space:
         return spaces.Discrete(3)
@@ -37,10 +35,10 @@ class Greeting(ParallelEnv):
 
     def step(self, actions: dict[str, int]) -> Any:
         acted, self.time = self.agents, self.time + 1
-        over = self.time == 8
+        over, reward = self.time == 8, float(actions["guest"] == actions["host"])
         self.agents = [] if over else acted
-        values = int(self.rng.integers(3)), float(actions["guest"] == actions["host"]), over, False
-        return *(dict.fromkeys(acted, value) for value in values), {agent: {} for agent in acted}
+        observations, rewards = dict.fromkeys(acted, int(self.rng.integers(3))), dict.fromkeys(acted, reward)
+        return observations, rewards, dict.fromkeys(acted, over), dict.fromkeys(acted, False), {agent: {} for agent in acted}
 
 
 def same_cue(cue: int) -> int:
@@ -53,29 +51,21 @@ def next_cue(cue: int) -> int:
     return (cue + 1) % 3
 
 
-def make_env(host: Any, seed: int) -> VecEnv:
-    """Make the guest's environment. A host is a callable, an SB3 model, or the path of its zip or of a whole team's."""
-    kwargs = {"parallel_env": Greeting, "agent": "guest", "partners": {"host": host}}
-    return make_vec_env(AgentEnv, n_envs=8, seed=seed, env_kwargs=kwargs)
-
-
-def main(total_timesteps: int = 10_000) -> dict[str, float]:
+def main(total_timesteps: int = 10_000) -> dict[str, Any]:
     """Train a guest with one host and then with another, and return the numbers that are printed."""
-    env = make_env(same_cue, seed=0)
+    # A partner is a callable, an SB3 model, or the path of its zip or of a whole team's
+    kwargs = {"parallel_env": Greeting, "agent": "guest", "partners": {"host": same_cue}}
+    env, eval_env = (make_vec_env(AgentEnv, n_envs=8, seed=seed, env_kwargs=kwargs) for seed in (0, 1000))
     guest = BeliefPPO("BeliefPolicy", env, seed=0, n_steps=64, batch_size=128, learning_rate=1e-3, gamma=0.0, ent_coef=0.01)
 
-    def equal_actions(host: Any) -> float:
-        returns, _ = evaluate_policy(guest, make_env(host, seed=1000), n_eval_episodes=100, return_episode_rewards=True)
-        return float(np.mean(returns))
-
     guest.learn(total_timesteps // 2)
-    known, new = equal_actions(same_cue), equal_actions(next_cue)
-    env.env_method("set_partner", "host", next_cue)
+    known, _ = evaluate_policy(guest, eval_env, n_eval_episodes=100)
+    for each in (env, eval_env):
+        each.env_method("set_partner", "host", next_cue)
+    new, _ = evaluate_policy(guest, eval_env, n_eval_episodes=100)
     guest.learn(total_timesteps // 2, reset_num_timesteps=False)
-    adapted = equal_actions(next_cue)
-    print(
-        f"Equal actions, of 8: {known:.1f} with the first host, {new:.1f} with a new one, {adapted:.1f} after adapting to it."
-    )
+    adapted, _ = evaluate_policy(guest, eval_env, n_eval_episodes=100)
+    print(f"Equal actions, of 8: {known:.1f} with the first host, {new:.1f} with a new one, {adapted:.1f} after adapting.")
     return {"known": known, "new": new, "adapted": adapted}
 
 
