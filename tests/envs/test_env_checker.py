@@ -169,19 +169,19 @@ class Sight(ToyEnv):
     """
     A ``ToyEnv`` with a given visibility.
 
-    :param told: What ``visibility()`` returns
+    :param rows: What ``visibility()`` returns
     """
 
-    def __init__(self, told):
+    def __init__(self, rows):
         super().__init__(n_agents=3)
-        self.told = told
+        self.rows = rows
 
     def visibility(self):
-        return self.told
+        return self.rows
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("rows", "message"),
     [
         ([[True, True]] * 3, "it returns a list at step 1"),
         ({"agent_0": [True]}, "the entry for 'agent_0' at step 1 is [True] (1)"),
@@ -190,13 +190,13 @@ class Sight(ToyEnv):
         ({"agent_0": [True, True]}, "no entry for 'agent_1', which acted at step 1"),
     ],
 )
-def test_visibility_that_cannot_be(told, message):
-    assert message in failures(Sight, env_kwargs={"told": told})["visibility"]
+def test_visibility_that_cannot_be(rows, message):
+    assert message in failures(Sight, env_kwargs={"rows": rows})["visibility"]
 
 
 def test_one_sided_visibility_is_told():
-    told = {"agent_0": [True, True], "agent_1": [False, False], "agent_2": [True, False]}
-    text = str(check_team_env(Sight, {"told": told}, n_steps=20))
+    rows = {"agent_0": [True, True], "agent_1": [False, False], "agent_2": [True, False]}
+    text = str(check_team_env(Sight, {"rows": rows}, n_steps=20))
     # Of the three pairs only 0 and 1 are one-sided
     assert "50.0% of the others' actions are visible, one-sided in 33.3% of the pairs" in text
 

@@ -33,15 +33,15 @@ def played(wrapper: Callable[[ParallelEnv], ParallelEnv] | None) -> list[dict[st
     env = make_team_env("traffic-junction-easy", n_envs=1, seed=0, wrapper=wrapper or (lambda env: env))
     env.reset()
     rng = np.random.default_rng(0)
-    told: list[dict[str, Any]] = []
+    seen: list[dict[str, Any]] = []
     for _ in range(60):
         masks = env.action_masks()
         assert masks is not None
         _, rewards, dones, infos = env.step({agent: rng.integers(2, size=1) for agent in env.possible_agents})
         keys = ("visible", "active", "life_end", "truncated", "agent_rewards")
-        told.append({key: infos[0][key] for key in keys})
-        told[-1].update(masks=np.stack(list(masks.values())), reward=rewards, done=dones, success=infos[0].get("is_success"))
-    return told
+        seen.append({key: infos[0][key] for key in keys})
+        seen[-1].update(masks=np.stack(list(masks.values())), reward=rewards, done=dones, success=infos[0].get("is_success"))
+    return seen
 
 
 @pytest.mark.parametrize("name", WRAPPERS)

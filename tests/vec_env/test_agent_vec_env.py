@@ -23,15 +23,15 @@ def sample(env, rng_seed):
 
 def test_others_actions_are_what_gymnasium_flattens():
     env = make_team_env(MixedEnv, n_envs=3)
-    scheduler = JointLoop(env)
+    loop = JointLoop(env)
     env.reset()
     for t in range(7):
         actions = sample(env, 10 * t)
-        parts = scheduler._splitter.split(actions, step := env.step(actions))
-        for i, (agent, part) in enumerate(zip(AGENTS, parts, strict=True)):
+        transitions = loop._splitter.split(actions, step := env.step(actions))
+        for i, (agent, transition) in enumerate(zip(AGENTS, transitions, strict=True)):
             others = [other for other in AGENTS if other != agent]
-            assert np.array_equal(part[1], [info["agent_rewards"][i] for info in step[3]])
-            for e, info in enumerate(part[3]):
+            assert np.array_equal(transition[1], [info["agent_rewards"][i] for info in step[3]])
+            for e, info in enumerate(transition[3]):
                 assert info["others_visible"].tolist() == step[3][e]["visible"][i].tolist()
                 expected = [
                     spaces.flatten(env.action_space[other], actions[other][e]) * visible
@@ -40,9 +40,9 @@ def test_others_actions_are_what_gymnasium_flattens():
                 assert info["others_actions"].dtype == np.float32
                 assert info["others_actions"].tolist() == np.concatenate(expected).astype(np.float32).tolist()
                 assert info["active"] is True
-        told = scheduler.agent_envs["multi"].get_attr("others_action_spaces")
-        assert len(told) == 3 and type(told[0]) is dict
-        assert list(told[0].items()) == [(other, env.action_space[other]) for other in ("zeta", "box", "binary")]
+        others_spaces = loop.agent_envs["multi"].get_attr("others_action_spaces")
+        assert len(others_spaces) == 3 and type(others_spaces[0]) is dict
+        assert list(others_spaces[0].items()) == [(other, env.action_space[other]) for other in ("zeta", "box", "binary")]
 
 
 def test_nothing_of_invisible_actions_reaches_an_agent():
@@ -52,17 +52,17 @@ def test_nothing_of_invisible_actions_reaches_an_agent():
         ]
 
     env = make_team_env(MixedEnv, n_envs=2)
-    views = TransitionSplitter(AGENTS, {agent: env.action_space[agent] for agent in AGENTS})
+    splitter = TransitionSplitter(AGENTS, {agent: env.action_space[agent] for agent in AGENTS})
     env.reset()
     actions = sample(env, 0)
     step = env.step(actions)
-    before = views.split(actions, step)
+    before = splitter.split(actions, step)
     for j, other in enumerate(AGENTS):
         changed = {**actions, other: sample(env, 50)[other]}
         if other == "box":
             changed["box"] = np.full((2, 2), np.nan, dtype=np.float32)
         assert not np.array_equal(changed[other], actions[other])
-        after = views.split(changed, step)
+        after = splitter.split(changed, step)
         for i in range(4):
             if i == j:
                 continue
@@ -72,10 +72,10 @@ def test_nothing_of_invisible_actions_reaches_an_agent():
 
 def test_who_ends_when():
     env = make_team_env(ScriptedEnv)
-    views = TransitionSplitter(env.possible_agents, {agent: env.action_space[agent] for agent in env.possible_agents})
+    splitter = TransitionSplitter(env.possible_agents, {agent: env.action_space[agent] for agent in env.possible_agents})
     env.reset()
     actions = {agent: np.ones(1, int) for agent in env.possible_agents}
-    steps = [views.split(actions, env.step(actions)) for _ in range(8)]
+    steps = [splitter.split(actions, env.step(actions)) for _ in range(8)]
     stays, dies, cut, last = zip(*steps, strict=True)
     dones = [[int(step[2][0]) for step in agent] for agent in (stays, dies, cut, last)]
     assert dones == [[0, 0, 1, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 0, 0, 1], [0, 0, 0, 0, 0, 1, 0, 1], [0] * 7 + [1]]
@@ -101,7 +101,7 @@ def test_who_ends_when():
 
 
 def test_an_inactive_slot_is_not_bootstrapped():
-    views = TransitionSplitter(["a", "b"], {"a": spaces.Discrete(2), "b": spaces.Discrete(2)})
+    splitter = TransitionSplitter(["a", "b"], {"a": spaces.Discrete(2), "b": spaces.Discrete(2)})
     info = {
         "agent_rewards": np.zeros(2, np.float32),
         "visible": np.zeros((2, 1), bool),
@@ -112,31 +112,33 @@ def test_an_inactive_slot_is_not_bootstrapped():
     }
     actions = {"a": np.zeros(1, int), "b": np.zeros(1, int)}
     obs = {"a": np.zeros((1, 1)), "b": np.zeros((1, 1))}
-    a, b = views.split(actions, (obs, np.zeros(1), np.ones(1, bool), [info]))
+    a, b = splitter.split(actions, (obs, np.zeros(1), np.ones(1, bool), [info]))
     assert a[3][0]["TimeLimit.truncated"] is False and b[3][0]["TimeLimit.truncated"] is True
 
 
-def test_parts_share_no_memory():
+def test_transitions_share_no_memory():
     env = make_team_env(MixedEnv, n_envs=2)
-    views = TransitionSplitter(AGENTS, {agent: env.action_space[agent] for agent in AGENTS})
+    splitter = TransitionSplitter(AGENTS, {agent: env.action_space[agent] for agent in AGENTS})
     env.reset()
     step = env.step(actions := sample(env, 0))
-    parts = views.split(actions, step)
-    parts[0][1][:] = 77.0
-    parts[0][2][:] = True
-    assert all((part[1] != 77.0).all() and not part[2].any() for part in parts[1:])
+    transitions = splitter.split(actions, step)
+    transitions[0][1][:] = 77.0
+    transitions[0][2][:] = True
+    assert all((transition[1] != 77.0).all() and not transition[2].any() for transition in transitions[1:])
     assert all((info["agent_rewards"] != 77.0).all() for info in step[3])
 
 
 def test_one_agent_has_no_others():
-    views = TransitionSplitter(["solo"], {"solo": spaces.Discrete(2)})
+    splitter = TransitionSplitter(["solo"], {"solo": spaces.Discrete(2)})
     info = {
         "agent_rewards": np.ones(1, np.float32),
         "visible": np.zeros((1, 0), bool),
         **{key: np.zeros(1, bool) for key in ("active", "life_end", "truncated")},
     }
-    (part,) = views.split({"solo": np.zeros(1, int)}, ({"solo": np.zeros((1, 1))}, np.zeros(1), np.zeros(1, bool), [info]))
-    assert part[3][0]["others_actions"].shape == (0,) and part[3][0]["others_visible"].shape == (0,)
+    (transition,) = splitter.split(
+        {"solo": np.zeros(1, int)}, ({"solo": np.zeros((1, 1))}, np.zeros(1), np.zeros(1, bool), [info])
+    )
+    assert transition[3][0]["others_actions"].shape == (0,) and transition[3][0]["others_visible"].shape == (0,)
 
 
 def test_many_agents_stay_cheap():
@@ -147,7 +149,7 @@ def test_many_agents_stay_cheap():
     """
     n, e = 10, 32
     names = [f"a{i}" for i in range(n)]
-    views = TransitionSplitter(names, {name: spaces.Discrete(2) for name in names})
+    splitter = TransitionSplitter(names, {name: spaces.Discrete(2) for name in names})
     info = {"agent_rewards": np.zeros(n, np.float32), "visible": np.ones((n, n - 1), bool)}
     info |= {key: np.zeros(n, bool) for key in ("active", "life_end", "truncated")}
     actions = {name: np.zeros(e, int) for name in names}
@@ -155,6 +157,6 @@ def test_many_agents_stay_cheap():
     times = []
     for _ in range(50):
         start = time.perf_counter()
-        views.split(actions, step)
+        splitter.split(actions, step)
         times.append(time.perf_counter() - start)
     assert min(times) < 2e-3

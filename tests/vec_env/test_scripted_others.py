@@ -33,7 +33,7 @@ def play(env, n_steps, seed=0):
 
     :return: The loop, and for each step the joint actions, the joint step and the agents' transitions
     """
-    scheduler = JointLoop(env)
+    loop = JointLoop(env)
     env.reset()
     rng = np.random.default_rng(seed)
     record = []
@@ -41,19 +41,21 @@ def play(env, n_steps, seed=0):
         ball = rng.uniform(-1, 1, (env.num_envs, 1)).astype(np.float32)
         actions = {"arrow": rng.integers(0, 3, env.num_envs), "ball": ball}
         step = env.step(actions)
-        record.append((actions, step, scheduler._splitter.split(actions, step)))
-    return scheduler, record
+        record.append((actions, step, loop._splitter.split(actions, step)))
+    return loop, record
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
 @pytest.mark.parametrize("env_class", [PartneredEnv, BlinkingEnv])
 def test_agents_are_told_what_they_could_see(env_class, vec_env):
     env = make_team_env(env_class, n_envs=2, vec_env=vec_env)
-    scheduler, record = play(env, 14)
+    loop, record = play(env, 14)
     for agent, other in (("arrow", "ball"), ("ball", "arrow")):
-        told = scheduler.agent_envs[agent].get_attr("others_action_spaces")[0]
-        assert list(told) == [other, "wind", "leader"]
-        assert told["wind"] == spaces.Box(-100, 100, (2,), np.float32) and told["leader"] == spaces.Discrete(4)
+        others_spaces = loop.agent_envs[agent].get_attr("others_action_spaces")[0]
+        assert list(others_spaces) == [other, "wind", "leader"]
+        assert others_spaces["wind"] == spaces.Box(-100, 100, (2,), np.float32) and others_spaces["leader"] == spaces.Discrete(
+            4
+        )
     for k, (actions, step, (arrow, ball)) in enumerate(record):
         t, episode = k % 6 + 1, k // 6 + 1
         wind, leader = [t, -episode], [float(a == (t - 1) % 4) for a in range(4)]
@@ -66,13 +68,13 @@ def test_agents_are_told_what_they_could_see(env_class, vec_env):
             seen_by_arrow = [bits[0] and in_play, bits[1], bits[2]]
             seen_by_ball = [in_play and seen for seen in rest]
             one_hot = [float(a == actions["arrow"][e]) for a in range(3)]
-            views: Any = (
+            expectations: Any = (
                 (arrow[3][e], seen_by_arrow, ([float(actions["ball"][e, 0])], wind, leader)),
                 (ball[3][e], seen_by_ball, (one_hot, wind, leader)),
             )
-            for info, seen, parts in views:
+            for info, seen, others in expectations:
                 assert info["others_visible"].tolist() == seen
-                expected = [x if is_seen else 0.0 for part, is_seen in zip(parts, seen, strict=True) for x in part]
+                expected = [x if is_seen else 0.0 for action, is_seen in zip(others, seen, strict=True) for x in action]
                 assert info["others_actions"].dtype == np.float32
                 assert info["others_actions"].tolist() == expected
     # At the last step of an episode the actions are those of that step, not those after the reset
@@ -84,7 +86,7 @@ def test_workers_equal_in_process():
     runs = []
     for vec_env in ("dummy", "subproc"):
         env = make_team_env(BlinkingEnv, n_envs=3, seed=1, vec_env=vec_env)
-        runs.append([parts for *_, parts in play(env, 14)[1]])
+        runs.append([transitions for *_, transitions in play(env, 14)[1]])
         env.close()
     for first, second in zip(*runs, strict=True):
         for one, two in zip(first, second, strict=True):
@@ -97,7 +99,7 @@ def test_workers_equal_in_process():
 @pytest.mark.parametrize("sees", [True, False])
 def test_nothing_of_an_invisible_scripted_action_reaches_an_agent(sees):
     agent_spaces: dict[str, spaces.Space] = {"a": spaces.Discrete(2), "b": spaces.Discrete(2)}
-    views = TransitionSplitter(["a", "b"], agent_spaces, {"x": spaces.Box(-1, 1, (2,)), "y": spaces.MultiDiscrete([2, 3])})
+    splitter = TransitionSplitter(["a", "b"], agent_spaces, {"x": spaces.Box(-1, 1, (2,)), "y": spaces.MultiDiscrete([2, 3])})
     info = {
         "agent_rewards": np.zeros(2, np.float32),
         "visible": np.array([[True, sees, True], [True, True, True]]),
@@ -107,9 +109,9 @@ def test_nothing_of_an_invisible_scripted_action_reaches_an_agent(sees):
     }
     obs = {"a": np.zeros((1, 1)), "b": np.zeros((1, 1))}
     actions = {"a": np.ones(1, int), "b": np.zeros(1, int)}
-    a, b = views.split(actions, (obs, np.zeros(1), np.zeros(1, bool), [info]))
-    told = a[3][0]["others_actions"]
-    np.testing.assert_array_equal(told, [1, 0, *([np.nan, 0.5] if sees else [0, 0]), 0, 1, 1, 0, 0])
+    a, b = splitter.split(actions, (obs, np.zeros(1), np.zeros(1, bool), [info]))
+    others_actions = a[3][0]["others_actions"]
+    np.testing.assert_array_equal(others_actions, [1, 0, *([np.nan, 0.5] if sees else [0, 0]), 0, 1, 1, 0, 0])
     np.testing.assert_array_equal(b[3][0]["others_actions"], [0, 1, np.nan, 0.5, 0, 1, 1, 0, 0])
 
 
@@ -131,26 +133,26 @@ class Changed(PartneredEnv):
     """
     A ``PartneredEnv`` with other scripted actions, spaces or visibility.
 
-    :param told: Scripted actions that replace those of the class
+    :param replaced: Scripted actions that replace those of the class
     :param scripted_spaces: ``scripted_action_spaces``. None for those of the class
     :param rows: What ``visibility()`` returns. None for no ``visibility()``
     """
 
-    def __init__(self, told=None, scripted_spaces=None, rows=None):
+    def __init__(self, replaced=None, scripted_spaces=None, rows=None):
         super().__init__()
-        self.told = told
+        self.replaced = replaced
         if scripted_spaces is not None:
             self.scripted_action_spaces = scripted_spaces
         if rows is not None:
             self.visibility = lambda: rows
 
     def scripted_actions(self):
-        return {**super().scripted_actions(), **self.told} if self.told else super().scripted_actions()
+        return {**super().scripted_actions(), **self.replaced} if self.replaced else super().scripted_actions()
 
 
 @pytest.mark.parametrize("action", [4, -1, 1.0, [1], None, "gas"])
 def test_actions_that_do_not_fit_a_discrete_space(action):
-    env = JointEnv(Changed(told={"leader": action}))
+    env = JointEnv(Changed(replaced={"leader": action}))
     env.reset()
     with pytest.raises(ValueError, match=r"for 'leader', which is no action of Discrete\(4\): return what it did"):
         env.step({"arrow": 0, "ball": [0.0]})
@@ -158,7 +160,7 @@ def test_actions_that_do_not_fit_a_discrete_space(action):
 
 @pytest.mark.parametrize("action", [0.5, [0.5], [[0.5, 0.5]], ["a", "b"]])
 def test_actions_that_do_not_fit_a_box(action):
-    env = JointEnv(Changed(told={"wind": action}))
+    env = JointEnv(Changed(replaced={"wind": action}))
     env.reset()
     with pytest.raises(ValueError, match=r"for 'wind', which is no action of Box\(.*correct its entry"):
         env.step({"arrow": 0, "ball": [0.0]})
@@ -166,11 +168,11 @@ def test_actions_that_do_not_fit_a_box(action):
 
 def test_actions_of_every_kind_of_space():
     kinds = {"x": spaces.MultiDiscrete([2, 3]), "y": spaces.MultiBinary(2), "z": spaces.Box(-1, 1, (2, 2))}
-    told = {"z": [[0.5, -1], [7, 0]], "y": [True, False], "x": (1, 0)}
+    scripted = {"z": [[0.5, -1], [7, 0]], "y": [True, False], "x": (1, 0)}
 
     class Kinds(Changed):
         def scripted_actions(self):
-            return told
+            return scripted
 
     env = make_team_env(Kinds, env_kwargs={"scripted_spaces": kinds})
     env.reset()
@@ -178,14 +180,14 @@ def test_actions_of_every_kind_of_space():
     # MultiDiscrete is one-hot for each dimension. MultiBinary and Box keep their numbers, also those out of bounds
     assert env.step(actions)[3][0]["scripted_actions"].tolist() == [0, 1, 1, 0, 0, 1, 0, 0.5, -1, 7, 0]
     for name, wrong in (("x", [2, 0]), ("x", [1]), ("y", [2, 0]), ("y", [1, 0, 0])):
-        told = {**told, name: wrong}
+        scripted = {**scripted, name: wrong}
         with pytest.raises(ValueError, match=f"for '{name}', which is no action of Multi"):
             env.step(actions)
-        told = {"z": np.zeros((2, 2)), "y": [1, 1], "x": [0, 2]}
+        scripted = {"z": np.zeros((2, 2)), "y": [1, 1], "x": [0, 2]}
 
 
 def test_actions_of_the_wrong_partners():
-    env = JointEnv(Changed(told={"ghost": 0}))
+    env = JointEnv(Changed(replaced={"ghost": 0}))
     env.reset()
     with pytest.raises(ValueError, match=r"each of \['wind', 'leader'\]: missing \[\], unknown \['ghost'\]"):
         env.step({"arrow": 0, "ball": [0.0]})
@@ -315,11 +317,11 @@ def test_a_team_learns_with_a_belief_about_them(normalize, wrap):
         assert list(model.get_env().get_attr("others_action_spaces")[0]) == [other, "wind", "leader"]
         buffer = model.rollout_buffer
         # After the update the rows of a copy stand one after the other. The third rollout is two episodes of 6 steps
-        told = buffer.others_actions.reshape(2, 12, -1)[0]
-        assert told.shape == (12, own_width + 2 + 4)
+        others_actions = buffer.others_actions.reshape(2, 12, -1)[0]
+        assert others_actions.shape == (12, own_width + 2 + 4)
         assert buffer.others_visible.all()
-        np.testing.assert_array_equal(told[:, own_width], [1, 2, 3, 4, 5, 6] * 2)
-        np.testing.assert_array_equal(told[:, own_width + 2 :], np.eye(4)[[0, 1, 2, 3, 0, 1] * 2])
+        np.testing.assert_array_equal(others_actions[:, own_width], [1, 2, 3, 4, 5, 6] * 2)
+        np.testing.assert_array_equal(others_actions[:, own_width + 2 :], np.eye(4)[[0, 1, 2, 3, 0, 1] * 2])
         assert np.isfinite(model.logger.name_to_value["belief/action_loss"])
         assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
 

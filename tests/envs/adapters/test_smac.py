@@ -210,9 +210,9 @@ def test_visibility(faults, maker, matrix_is_right):
         apart = {a: 2 + i % 4 for i, a in enumerate(env.possible_agents) if env._masks[i, 2 + i % 4]}
         random_play(env, generator, apart if generator.random() < 0.5 else None)
         sees, wrong = visible_from_positions(env)
-        told = env.visibility()
+        visible = env.visibility()
         for i, agent in enumerate(env.possible_agents):
-            assert told[agent].tolist() == np.delete(sees[i], i).tolist()
+            assert visible[agent].tolist() == np.delete(sees[i], i).tolist()
         alive = sum(unit.health > 0 for unit in env.game.agents.values())
         hidden += alive * (alive - 1) - sees.sum()
         differences += wrong
@@ -225,15 +225,15 @@ def test_visibility(faults, maker, matrix_is_right):
 
 
 def test_observations(faults):
-    plain, timed, told = make("2s3z"), make("2s3z", obs_timestep_number=True), make("2s3z", obs_last_action=True)
+    plain, timed, acted = make("2s3z"), make("2s3z", obs_timestep_number=True), make("2s3z", obs_last_action=True)
     timed_v2 = make_v2("protoss_5_vs_5", obs_timestep_number=True)
-    for env in (plain, timed, told, timed_v2):
+    for env in (plain, timed, acted, timed_v2):
         observations, _ = env.reset(seed=3)
         for agent, space in env.observation_spaces.items():
             assert observations[agent].shape == space.shape and observations[agent].dtype == np.float32
     # SMAC's observations have one entry more than get_obs_size() says, since the time step is appended as well
     assert timed.width == plain.width + 2 and timed.game.get_obs_size() == plain.width + 1
-    assert told.width == plain.width + 4 * 11
+    assert acted.width == plain.width + 4 * 11
     assert not plain.game.obs_last_action
 
 

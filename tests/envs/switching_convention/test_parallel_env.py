@@ -80,20 +80,20 @@ def test_rewards_and_leader_step_by_step(kwargs):
 @pytest.mark.parametrize("leader_visible", [True, False])
 def test_the_followers_history_pairs_cues_with_what_the_leader_did_at_them(env_name, kwargs, leader_visible):
     env = make_team_env(env_name, 2, seed=0, env_kwargs={**kwargs, "leader_visible": leader_visible})
-    scheduler = JointLoop(env)
-    assert scheduler.agent_envs["follower"].get_attr("others_action_spaces") == [{"leader": spaces.Discrete(3)}] * 2
+    loop = JointLoop(env)
+    assert loop.agent_envs["follower"].get_attr("others_action_spaces") == [{"leader": spaces.Discrete(3)}] * 2
     obs = env.reset()["follower"]
     generator = np.random.default_rng(0)
     for _ in range(20):
         played = [int(convention[cue]) for convention, cue in zip(env.get_attr("convention"), obs, strict=True)]
         actions = {"follower": generator.integers(3, size=2)}
-        (part,) = scheduler._splitter.split(actions, env.step(actions))
+        (transition,) = loop._splitter.split(actions, env.step(actions))
         for i in range(2):
             expected = np.eye(3)[played[i]] if leader_visible else np.zeros(3)
-            assert part[3][i]["others_actions"].tolist() == expected.tolist()
-            assert part[3][i]["others_visible"].tolist() == [leader_visible]
-            assert part[1][i] == (actions["follower"][i] == played[i])
-        obs = part[0]
+            assert transition[3][i]["others_actions"].tolist() == expected.tolist()
+            assert transition[3][i]["others_visible"].tolist() == [leader_visible]
+            assert transition[1][i] == (actions["follower"][i] == played[i])
+        obs = transition[0]
     env.close()
 
 

@@ -50,14 +50,14 @@ def sampled(env, n_steps, seed=5):
 def team_steps(make, agent, actions, n_steps):
     """Return the first observation and the transitions that the agent gets in a team."""
     env = make_team_env(make, n_envs=1, seed=11)
-    scheduler = JointLoop(env)
+    loop = JointLoop(env)
     first = env.reset()[agent]
-    parts = []
+    transitions = []
     for t in range(n_steps):
         joint = {name: column[t][None] for name, column in actions.items()}
-        parts.append(scheduler._splitter.split(joint, env.step(joint))[env.possible_agents.index(agent)])
+        transitions.append(loop._splitter.split(joint, env.step(joint))[env.possible_agents.index(agent)])
     env.close()
-    return first, parts
+    return first, transitions
 
 
 ENVS: dict[str, tuple[Any, list[str]]] = {
@@ -78,7 +78,7 @@ def test_the_learner_meets_what_it_meets_in_a_team(make, agent):
     n_steps = 90
     template = make_team_env(make, n_envs=1)
     actions = sampled(template, n_steps)
-    first, parts = team_steps(make, agent, actions, n_steps)
+    first, transitions = team_steps(make, agent, actions, n_steps)
 
     partners = {name: Playback(column) for name, column in actions.items() if name != agent}
     env: Any = DummyVecEnv([lambda: AgentEnv(make, agent, partners)])
@@ -87,7 +87,7 @@ def test_the_learner_meets_what_it_meets_in_a_team(make, agent):
     env.seed(11)
     assert np.array_equal(env.reset(), first)
     n_dones = n_cut = 0
-    for action, (obs, rewards, dones, infos) in zip(actions[agent], parts, strict=True):
+    for action, (obs, rewards, dones, infos) in zip(actions[agent], transitions, strict=True):
         found_obs, found_rewards, found_dones, found_infos = env.step(action[None])
         assert found_obs.dtype == obs.dtype and np.array_equal(found_obs, obs)
         assert found_rewards.dtype == rewards.dtype and np.array_equal(found_rewards, rewards)
@@ -114,7 +114,7 @@ def test_a_learner_that_has_left_does_not_wait_for_the_others(agent, last, cut):
     n_steps = 3 * 8
     template = make_team_env(ScriptedEnv, n_envs=1)
     actions = sampled(template, n_steps)
-    _, parts = team_steps(ScriptedEnv, agent, actions, n_steps)
+    _, transitions = team_steps(ScriptedEnv, agent, actions, n_steps)
     partners = {name: Playback(column) for name, column in actions.items() if name != agent}
     env = AgentEnv(ScriptedEnv, agent, partners)
     for episode in range(3):
@@ -123,7 +123,7 @@ def test_a_learner_that_has_left_does_not_wait_for_the_others(agent, last, cut):
         for t in range(last):
             k = 8 * episode + t
             obs, reward, terminated, truncated, info = env.step(actions[agent][k])
-            _, rewards, dones, infos = parts[k]
+            _, rewards, dones, infos = transitions[k]
             assert reward == rewards[0] and (terminated or truncated) == dones[0] and truncated == (cut and t == last - 1)
             assert np.array_equal(info["others_actions"], infos[0]["others_actions"]) and info["active"]
         assert (terminated or truncated) and obs.tolist() == [last, 10 * (episode + 1)]

@@ -71,7 +71,7 @@ def test_the_callers_random_numbers_are_left_alone():
     assert state() == before
 
 
-def test_streams_go_on_over_calls():
+def test_random_numbers_continue_over_calls():
     """A second ``learn`` does not repeat the random numbers of the first."""
     env = make_team_env(ToyEnv)
     record = Record(keep=("actions",))

@@ -112,13 +112,13 @@ def test_the_last_actions_of_allies_are_blanked_unless_asked_for(mixed):
             for copy in np.flatnonzero(~dones):
                 for j, ally in enumerate(a for a in mixed.possible_agents if a != agent):
                     action = int(actions[ally][copy])
-                    told = full[copy, j, 3:6]
+                    block = full[copy, j, 3:6]
                     if not infos[copy]["visible"][i, j]:
-                        assert not told.any()
+                        assert not block.any()
                         continue
                     expected = directions[action] if action < STOP else np.zeros(2)
-                    np.testing.assert_allclose(told[:2], expected, atol=1e-6)
-                    np.testing.assert_allclose(told[2], action / (n_actions - 1) if action > STOP else 0.0, rtol=1e-6)
+                    np.testing.assert_allclose(block[:2], expected, atol=1e-6)
+                    np.testing.assert_allclose(block[2], action / (n_actions - 1) if action > STOP else 0.0, rtol=1e-6)
                     moved += action < STOP
                     shot += action > STOP
     assert moved > 0 and shot > 0

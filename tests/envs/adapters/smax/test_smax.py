@@ -108,8 +108,8 @@ def test_state_resumes_exactly(mixed):
         rows = []
         for draw in draws:
             obs, rewards, dones, infos = env.step(dict(zip(env.possible_agents, draw, strict=True)))
-            told = [{**info, "episode": info.get("episode", {}).get("r")} for info in infos]
-            rows.append((obs, rewards, dones, told, env.action_masks()))
+            untimed = [{**info, "episode": info.get("episode", {}).get("r")} for info in infos]
+            rows.append((obs, rewards, dones, untimed, env.action_masks()))
         return pickle.dumps(rows)
 
     mixed.seed(5)
