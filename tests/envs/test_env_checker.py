@@ -256,11 +256,15 @@ def test_a_state_that_lacks_something():
 
 
 class Nested(ToyEnv):
+    """A ``ToyEnv`` with a nested observation space."""
+
     def observation_space(self, agent):
         return spaces.Dict({"a": spaces.Box(0, 1, (2,), np.float32)})
 
 
 class Fickle(ToyEnv):
+    """A ``ToyEnv`` whose observation space changes between calls."""
+
     calls = 0
 
     def observation_space(self, agent):
@@ -269,11 +273,15 @@ class Fickle(ToyEnv):
 
 
 class ResetsWrong(ToyEnv):
+    """A ``ToyEnv`` whose ``reset()`` returns no infos."""
+
     def reset(self, seed=None, options=None):
         return super().reset(seed)[0]
 
 
 class NobodyPlays(ToyEnv):
+    """A ``ToyEnv`` without agents after ``reset()``."""
+
     def reset(self, seed=None, options=None):
         result = super().reset(seed)
         self.agents = []

@@ -275,11 +275,15 @@ def test_nested_observations(vec_env):
 
 
 class Nested(ToyEnv):
+    """A ``ToyEnv`` with a nested observation space."""
+
     def observation_space(self, agent):
         return spaces.Dict({"a": spaces.Box(0, 1, (2,), np.float32)})
 
 
 class Wordy(ToyEnv):
+    """A ``ToyEnv`` with a Text observation space."""
+
     def observation_space(self, agent):
         return spaces.Text(5)
 

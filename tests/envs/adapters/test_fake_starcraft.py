@@ -9,6 +9,7 @@ from tests.envs.adapters import fake_smacv2, fake_starcraft
 
 
 def parameters(function):
+    """Return the names of a function's parameters."""
     return list(inspect.signature(function).parameters)
 
 

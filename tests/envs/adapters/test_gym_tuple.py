@@ -96,7 +96,7 @@ def test_spaces_and_observations():
     assert env.possible_agents == ["agent_0", "agent_1"] and env.metadata["name"] == "toy"
     assert [env.action_space(agent) for agent in env.possible_agents] == [spaces.Discrete(3), spaces.Discrete(2)]
     assert env.observation_space("agent_0") == BOX
-    # The two agents share one space object in the package. The copies keep one from being seeded with the other
+    # The package has one space object for both agents. The adapter copies it, so that seeding one does not seed the other
     assert env.observation_space("agent_0") is not env.observation_space("agent_1")
     first, infos = env.reset(seed=3, options={"level": 1})
     assert infos == {"agent_0": {}, "agent_1": {}} and env.game.options == {"level": 1}
@@ -123,11 +123,8 @@ def test_rewards(reward, own):
     [
         (GymTupleEnv(Toy()), 5, True),
         (GymTupleEnv(Toy(), max_episode_steps=4), 4, False),
-        (
-            GymTupleEnv(Toy(), max_episode_steps=5),
-            5,
-            True,
-        ),  # The last step terminates too: there is nothing to bootstrap
+        # The last step terminates too, so there is nothing to bootstrap
+        (GymTupleEnv(Toy(), max_episode_steps=5), 5, True),
         (GymTupleEnv(TimeLimit(Toy(), 2)), 2, False),
         (GymTupleEnv(TimeLimit(Toy(), 5)), 5, True),
         (Full(Toy((3,))), 3, False),  # The environment itself reports a termination

@@ -16,6 +16,7 @@ RADIUS = 0.7
 
 
 def random_actions(env, rng):
+    """Return random actions of the agents in play."""
     return {agent: int(rng.integers(env.action_space(agent).n)) for agent in env.agents}
 
 

@@ -15,6 +15,7 @@ from tests.team.toy_envs import MixedEnv, ToyEnv
 
 
 def newest(prefix):
+    """Return the id of the newest version of a module whose name begins with a prefix."""
     return f"pettingzoo/{[name for name in names() if name.startswith(prefix)][-1]}"
 
 

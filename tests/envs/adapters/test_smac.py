@@ -143,7 +143,7 @@ def battle_of_five_steps(is_won):
 @pytest.mark.parametrize("is_won", [True, False])
 def test_limits_are_bootstrapped_and_battles_that_are_over_are_not(faults, is_won):
     ends = check_advantages(partial(battle_of_five_steps, is_won), lambda last: is_won, 16, MaskableBeliefPPO)
-    assert len(ends) == 3 * 2 * 3  # agents, copies, battles
+    assert len(ends) == 3 * 2 * 3  # Agents, copies and battles
 
 
 def test_reset_of_smacv2_that_returns_nothing(faults):

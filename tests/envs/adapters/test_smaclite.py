@@ -17,10 +17,12 @@ from tests.envs.adapters.tuple_helpers import make_team, train_save_load_evaluat
 
 
 def fake(limit=60, **kwargs) -> Any:
+    """Return a battle of the fake."""
     return smaclite.Battle(FakeSMAClite(render_mode=None, **kwargs), limit)
 
 
 def real(name="2s3z", **kwargs) -> Any:
+    """Return a battle of the package. Where that is not installed, skip the test."""
     pytest.importorskip("smaclite", reason="SMAClite is not installed, see docs/environments/smaclite.md")
     return smaclite.make(name, **kwargs)
 

@@ -72,7 +72,7 @@ def test_who_never_looks_gets_one_in_m():
 @pytest.mark.parametrize("K", [2, 5])
 def test_who_looks_up_the_last_rollout_gets_the_optimum(K):
     means = rewards_by_rollout(Lookup(4), 150 * K, m=4, K=K).reshape(-1, K)
-    # What was learned of the previous convention excludes little else than that one, so it is right no more often than a guess
+    # What was learned of the previous convention says little about this one, and is right no more often than a guess
     first = means[:, 0]
     assert abs(first.mean() - 0.25) < 4 * first.std() / np.sqrt(len(first)) < 0.1
     assert (means[:, 1:] == 1.0).all()

@@ -12,6 +12,7 @@ N, R = 10, 12
 
 
 def one_hot(k, n):
+    """Return a list of ``n`` numbers, 1.0 at index ``k`` and 0.0 elsewhere."""
     return [float(j == k) for j in range(n)]
 
 

@@ -34,7 +34,7 @@ def sizes(monkeypatch):
         return call(self, flat, noise)
 
     monkeypatch.setattr(batcher.StackedNetworks, "__call__", count)
-    # Without the passes that only test whether batched and single passes agree
+    # The passes that only test whether batched and single passes agree are not counted
     monkeypatch.setattr(batcher, "_agrees", Agrees())
     return found
 
@@ -71,6 +71,7 @@ def learn_both_ways(monkeypatch, sizes, n_rollouts=3, callback=None, **kwargs):
 
 
 def toy_team(algo=PPO, env_id=lambda: ToyEnv(3), policy="MlpPolicy", **kwargs):
+    """Return a team in eight copies, by default of three PPO agents in a ``ToyEnv``."""
     if algo is PPO:
         kwargs = {**PPO_KWARGS, **kwargs}
     return Team(algo, policy, make_team_env(env_id, n_envs=8), seed=0, device="cpu", **kwargs)
@@ -108,7 +109,7 @@ def test_the_same_is_learned(case, monkeypatch, sizes):
 def test_the_policies_that_act_together_are_the_ones_that_agree(monkeypatch, sizes):
     monkeypatch.setattr(batcher, "_agrees", {})
     found = learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]})
-    # One pass of the 25 is the test whether they agree
+    # One of the 25 passes is the test of whether they agree
     assert found == [3] * 25
     # These layers are so small that batched products are rounded differently, so that the test is the only pass
     assert learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [3, 1]}) == [3]
@@ -209,6 +210,7 @@ def test_what_a_user_has_replaced_stays(sizes):
 
 
 def make_policies(n):
+    """Return ``n`` belief policies with a history of 60 steps."""
     others = {"other": spaces.Discrete(3)}
     space = spaces.Box(-10, 10, (6,)), spaces.Discrete(5)
     policies = [BeliefActorCriticPolicy(*space, lambda _: 1e-3, others_action_spaces=others) for _ in range(n)]
