@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from sb3_belief.zoo.errors import ConfigError
 
@@ -201,11 +202,17 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
     from sb3_belief.zoo.resume import resume_config
     from sb3_belief.zoo.train import TrainOptions, train
 
-    rest = (args.conf_file, args.params, args.env_kwargs, args.n_timesteps, tuple(args.allow_package))
+    settings: dict[str, Any] = {
+        "conf_file": args.conf_file,
+        "params": args.params,
+        "env_kwargs": args.env_kwargs,
+        "n_timesteps": args.n_timesteps,
+        "extra_packages": tuple(args.allow_package),
+    }
     if args.trained_agent is None:
-        config = load_config(args.algo or _ALGO, args.env or _ENV, *rest)
+        config = load_config(args.algo or _ALGO, args.env or _ENV, **settings)
     else:
-        config = resume_config(args.trained_agent, args.algo, args.env, *rest)
+        config = resume_config(args.trained_agent, args.algo, args.env, **settings)
     names = (
         "seed log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
         " vec_env device num_threads jobs progress trained_agent verbose"

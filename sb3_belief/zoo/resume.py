@@ -1,6 +1,7 @@
 """Settings of a run that continues training a saved team (``-i``)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from sb3_belief.zoo.config import RUN_KEYS, RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError, suggestion
@@ -17,9 +18,7 @@ def resume_config(
     env_id: str | None = None,
     conf_file: str | None = None,
     params: Sequence[str] = (),
-    env_kwargs: Sequence[str] = (),
-    n_timesteps: int | None = None,
-    extra_packages: tuple[str, ...] = (),
+    **further: Any,
 ) -> RunConfig:
     """
     Return the configuration of a run that continues training a saved team.
@@ -34,9 +33,7 @@ def resume_config(
         default
     :param conf_file: See ``load_config``
     :param params: See ``load_config``
-    :param env_kwargs: See ``load_config``
-    :param n_timesteps: Number of further joint steps
-    :param extra_packages: See ``load_config``
+    :param further: Further arguments of ``load_config``; ``n_timesteps`` is the number of further joint steps
     :return: The configuration
     :raises ConfigError: For settings that do not fit the saved team, or that ``load_config`` refuses
     """
@@ -58,4 +55,4 @@ def resume_config(
             conf_file = str(saved_conf)
     if algo is None or env_id is None:
         raise ConfigError(f"--trained-agent: {trained!r} is not in the folder of a run: give --algo and --env.")
-    return load_config(algo, env_id, conf_file, params, env_kwargs, n_timesteps, extra_packages)
+    return load_config(algo, env_id, conf_file, params, **further)
