@@ -74,7 +74,7 @@ test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from i
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" tests/envs $(PYTEST_ARGS)
 
 test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
-	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/test_smax.py tests/envs/test_smax_battles.py $(PYTEST_ARGS)
+	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/adapters/smax $(PYTEST_ARGS)
 
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
