@@ -10,8 +10,8 @@ class History(NamedTuple):
     The last ``T`` steps in which an agent was active (Sec. 4.1 of the paper), oldest first.
 
     :param observations: The agent's own observations, float ``[T, d_o]``
-    :param actions: The others' actions at the same steps, flattened and side by side, float ``[T, W]``.
-        Zero where an action was not visible
+    :param actions: The others' actions at the same steps, flattened and side by side, float ``[T, W]``. Zero where an
+        action was not visible
     :param valid: Whether each row holds a step, bool ``[T]``. All rows do once the agent has been active for ``T`` steps
     """
 

@@ -31,7 +31,7 @@ class ActionLayout:
     def __init__(self, widths: Sequence[Sequence[int]], kinds: Sequence[str]) -> None:
         if len(widths) != len(kinds) or not set(kinds) <= set(KINDS):
             raise ValueError(
-                f"widths speaks of {len(widths)} others, kinds is {list(kinds)}; there must be one kind for each other, "
+                f"widths describes {len(widths)} others, kinds is {list(kinds)}; there must be one kind for each other, "
                 f"of {', '.join(KINDS)}"
             )
         self.kinds = list(kinds)

@@ -15,7 +15,7 @@ def versions() -> dict[str, str]:
 
     :return: {name: version}
     """
-    # This package's own version is not asked from pip, which does not know a checkout that is run in place
+    # This package's own version is not looked up as the others' are, because a checkout that is run in place is not installed
     found = {"python": platform.python_version(), "sb3-belief": __version__}
     for package in _PACKAGES:
         try:

@@ -69,7 +69,7 @@ def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarra
     Read the episodes of a run and check that there are any.
 
     :param folder: Folder of a run
-    :return: As of ``read_monitor``
+    :return: The arrays that ``read_monitor`` returns
     :raises FileNotFoundError: If the run has no monitor file
     :raises ValueError: If the run has finished no episode
     """
