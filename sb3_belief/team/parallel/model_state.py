@@ -40,7 +40,13 @@ def modules_of(model: BaseAlgorithm) -> Iterator[tuple[str, nn.Module]]:
                 yield f"{name}.{path}".rstrip("."), module
 
 
-def _optimizers_of(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
+def optimizers_of(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
+    """
+    Return the optimizers of a model and of its networks.
+
+    :param model: A model
+    :return: The optimizers by path
+    """
     owners = [("", model), *((f"{path}.", module) for path, module in modules_of(model))]
     return {
         f"{path}{name}": value
@@ -153,18 +159,19 @@ class StateReader:
     """
     Reads what a model has become in a worker.
 
-    References to parts that the model had when it arrived are sent as their paths, so that they refer to the same parts in the
-    main process.
+    References to parts that the model had when it was unpacked are sent as their paths, so that they refer to the same parts
+    in the main process.
 
     :param model: Just unpacked
     """
 
     def __init__(self, model: Any):
         self._model = model
-        self._tensors = _tensors_of(model)
+        self._tensors = self._read_tensors = _tensors_of(model)
+        self._modules = dict(modules_of(model))
         parts = {"": model, "rollout_buffer": model.rollout_buffer, "logger": model.logger}
         # Kept alive, so that no other object gets the identity of one of them
-        self._parts = {**parts, **dict(modules_of(model)), **self._tensors, **_optimizers_of(model)}
+        self._parts = {**parts, **self._modules, **self._tensors, **optimizers_of(model)}
         self._known = {id(part): path for path, part in self._parts.items()}
 
     def read(self, with_buffer: bool) -> dict[str, Any]:
@@ -173,27 +180,38 @@ class StateReader:
 
         :param with_buffer: Whether to include the contents of the rollout buffer
         :return: The state, for :func:`write_state`
-        :raises RuntimeError: If parameters were added or removed
+        :raises RuntimeError: If parameters or modules of a network were added, removed or replaced by other modules
         """
-        # Attributes of networks that are new since then travel as a whole
-        attributes = {key: value for key, value in _attributes_of(self._model).items() if self._arrived(key[0])}
-        tensors = {path: tensor for path, tensor in _tensors_of(self._model).items() if self._arrived(path.rpartition(".")[0])}
-        if tensors.keys() != self._tensors.keys():
-            raise RuntimeError(f"train() of {type(self._model).__name__} adds or removes parameters of a network; use jobs=1.")
+        # Networks that are new attributes of the model travel as a whole; those that were sent must have kept their parts
+        roots = {path.partition(".")[0] for path in self._modules}
+        modules = {path: module for path, module in modules_of(self._model) if path.partition(".")[0] in roots}
+        attributes = {key: value for key, value in _attributes_of(self._model).items() if self._was_sent(key[0])}
+        tensors = {
+            path: tensor for path, tensor in _tensors_of(self._model).items() if self._was_sent(path.rpartition(".")[0])
+        }
+        same_modules = modules.keys() == self._modules.keys() and all(m is self._modules[path] for path, m in modules.items())
+        if not same_modules or tensors.keys() != self._tensors.keys():
+            raise RuntimeError(
+                f"train() of {type(self._model).__name__} adds or removes parameters or modules of a network; use jobs=1."
+            )
         state = {
             "tensors": {path: (tensor is self._tensors[path], tensor) for path, tensor in tensors.items()},
             "optimizers": {
                 path: optimizer.state_dict()
-                for path, optimizer in _optimizers_of(self._model).items()
+                for path, optimizer in optimizers_of(self._model).items()
                 if id(optimizer) in self._known
             },
             "attributes": dumps(attributes, self._known),
             "buffer": dumps(vars(self._model.rollout_buffer), self._known) if with_buffer else None,
         }
-        self._tensors = tensors
+        self._read_tensors = tensors
         return state
 
-    def _arrived(self, path: str) -> bool:
+    def mark_as_sent(self) -> None:
+        """Tell that the state that was read last is sent: tensors that are replaced from now on are compared with it."""
+        self._tensors = self._read_tensors
+
+    def _was_sent(self, path: str) -> bool:
         return id(_at(self._model, path)) in self._known
 
 
@@ -221,6 +239,7 @@ def _write_tensors(model: BaseAlgorithm, tensors: dict[str, tuple[bool, th.Tenso
     for path, (is_same, tensor) in tensors.items():
         if is_same and here[path].shape == tensor.shape:
             here[path].copy_(tensor)
+            here[path].requires_grad_(tensor.requires_grad)
             here[path].grad = tensor.grad
         else:
             # Replaced there, such as a history that was renewed: whoever holds the old one keeps it
@@ -230,7 +249,7 @@ def _write_tensors(model: BaseAlgorithm, tensors: dict[str, tuple[bool, th.Tenso
 
 
 def _write_optimizers(model: BaseAlgorithm, optimizers: dict[str, dict[str, Any]]) -> None:
-    here = _optimizers_of(model)
+    here = optimizers_of(model)
     for path, saved in optimizers.items():
         optimizer = here[path]
         params = [param for group in optimizer.param_groups for param in group["params"]]

@@ -4,7 +4,7 @@ A team's agents on several cores.
 Agents are independent, so those with on-policy algorithms can learn at the same time: each group of them in a process of its
 own, with the whole ``learn()`` of each agent (its policy, buffer, update and bookkeeping). Their models move to a worker when
 a team begins to learn. From then on all that travels is each agent's part of the joint steps and its actions. The models come
-back when the team has learned, or when something looks at them. What is learned, drawn and logged is the same as in one
+back when the team has learned, or when they are accessed. What is learned, drawn and logged is the same as in one
 process, bit for bit.
 """
 
@@ -22,7 +22,7 @@ from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.lockstep.scheduler import AgentTask
-from sb3_belief.team.parallel.model_state import modules_of, pack
+from sb3_belief.team.parallel.model_state import modules_of, optimizers_of, pack
 from sb3_belief.team.parallel.remote_agents import RemoteAgents
 from sb3_belief.team.parallel.workers import Workers
 
@@ -52,35 +52,42 @@ def leaves_models_alone(callback: BaseCallback | None) -> bool:
 
     :param callback: Of a team
     """
+    return _own_callback(callback) is None
+
+
+def _own_callback(callback: BaseCallback | None) -> Any:
+    """Return the first callback or function among those called that is not from SB3 or sb3-contrib; None without one."""
     if callback is None:
-        return True
+        return None
     if isinstance(callback, ConvertCallback):
-        return callback.callback is None
+        return callback.callback
     if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
-        return False
+        return callback
     called = [
         *getattr(callback, "callbacks", []),
         *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
     ]
-    return all(leaves_models_alone(each) for each in called)
+    return next((own for own in map(_own_callback, called) if own is not None), None)
 
 
-def can_learn_elsewhere(model: BaseAlgorithm, loop: JointLoop, task: AgentTask) -> bool:
+def can_learn_elsewhere(model: OnPolicyAlgorithm, loop: JointLoop, agent: str, task: AgentTask) -> bool:
     """
     Tell whether nothing in this process takes part in an agent's learning.
 
     :param model: The agent's model
     :param loop: Its team's loop
-    :param task: The agent's task
+    :param agent: Its name
+    :param task: Its task
     :return: False for a callback of the agent's own, replaced methods, hooks in a network, and another environment than the
         team's
     """
-    if task.callback is not None or model.env is None or model.env.unwrapped not in loop.agent_envs.values():
+    if task.callback is not None or model.env is None or model.env.unwrapped is not loop.agent_envs[agent]:
         return False
-    for owner in (model, model.policy):
+    modules = [module for _, module in modules_of(model)]
+    for owner in (model, model.rollout_buffer, *modules, *optimizers_of(model).values()):
         if any(inspect.isroutine(getattr(type(owner), name, None)) for name in vars(owner)):
             return False
-    return not any(vars(module)[hooks] for _, module in modules_of(model) for hooks in _HOOKS)
+    return not any(vars(module)[hooks] for module in modules for hooks in _HOOKS)
 
 
 class ParallelLearning:
@@ -165,20 +172,23 @@ class ParallelLearning:
         n_processes = min(self._jobs, len(models))
         if n_processes <= 1:
             return {}
-        if not leaves_models_alone(callback):
+        own = _own_callback(callback)
+        if own is not None:
+            name = getattr(own, "__name__", type(own).__name__)
             warnings.warn(
-                f"All agents learn in one process, although jobs={self._jobs}: the team has a callback that is not from SB3"
-                " or sb3-contrib, which may look at the models or change them at any step. Leave it out, or use jobs=1."
+                f"All agents learn in one process, although jobs={self._jobs}: the team's callback {name} is not from SB3 or"
+                " sb3-contrib, and may look at the models or change them at any step. Leave it out, or use jobs=1."
             )
             return {}
         chosen: dict[int, dict[str, BaseAlgorithm]] = {}
         for i, (agent, model) in enumerate(models.items()):
             worker = i % n_processes
-            if worker < n_processes - 1 and can_learn_elsewhere(model, loop, tasks[agent]):
+            if worker < n_processes - 1 and can_learn_elsewhere(model, loop, agent, tasks[agent]):
                 chosen.setdefault(worker, {})[agent] = model
         for group in chosen.values():
             for agent, learner in group.items():
-                # Refused now rather than with some models under way
+                # Refused now, before any model has moved
                 pack(agent, learner)
-        self._workers.start(n_processes - 1)
+        if chosen:
+            self._workers.start(n_processes - 1)
         return chosen

@@ -213,6 +213,7 @@ class WorkerServer:
                     "wrappers": [state_of(wrapper) for wrapper in wrappers_of(self._models[agent].env)],
                     "rng": self._rngs[agent],
                 }
+                reader.mark_as_sent()
             except Exception as error:
                 # The other agents' states are not lost with it
                 self._answer.update(_failure(error))

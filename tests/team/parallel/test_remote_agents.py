@@ -132,7 +132,8 @@ def test_a_callback_that_keeps_all_agents_here_is_warned_of(jobs, warned):
             team.learn(16, callback=Record())
         team.learn(16, callback=StopTrainingOnMaxEpisodes(100), agent_callbacks={"agent_0": Record()})
     messages = [str(w.message) for w in caught if "one process" in str(w.message)]
-    assert len(messages) == warned and all("although jobs=2" in m and "use jobs=1" in m for m in messages)
+    assert len(messages) == warned
+    assert all("although jobs=2" in m and "callback Record" in m and "use jobs=1" in m for m in messages)
 
 
 class Own(EvalCallback):
@@ -271,6 +272,50 @@ class FailsToCount(PPO):
             raise ZeroDivisionError("by hand")
 
 
+class GrowsALayer(PPO):
+    """Its policy has one more layer after the first update."""
+
+    def train(self):
+        super().train()
+        self.policy.more = th.nn.Linear(1, 1)
+
+
+class Freezes(PPO):
+    """It replaces one parameter and freezes another in its first update."""
+
+    def train(self):
+        super().train()
+        if self._n_updates == self.n_epochs:
+            layer: Any = self.policy.action_net
+            layer.bias = th.nn.Parameter(layer.bias + 0.1)
+            self.policy.value_net.weight.requires_grad_(False)
+
+
+def test_replaced_and_frozen_parameters_come_back_as_such():
+    results = []
+    for jobs in (1, 2):
+        team = toy_team(Freezes, jobs, **PPO_SMALL)
+        first, held = team.agents["agent_0"], team.agents["agent_0"].policy.action_net.bias
+        for _ in range(3):
+            team.learn(16, reset_num_timesteps=False)
+        assert first.policy.action_net.bias is not held
+        assert not first.policy.value_net.weight.requires_grad
+        results.append(everything(team, {}))
+    assert results[0] == results[1]
+
+
+def test_a_history_that_is_held_stays_as_it_was():
+    for jobs in (1, 2):
+        _, kwargs = LOOKED_AT["belief"]
+        team = toy_team(BeliefPPO, jobs, **kwargs).learn(16)
+        held = team.agents["car_0"].policy.history
+        before = [part.clone() for part in held]
+        for _ in range(2):
+            team.learn(16, reset_num_timesteps=False)
+        assert all(th.equal(part, old) for part, old in zip(held, before, strict=True))
+        assert not th.equal(team.agents["car_0"].policy.history.observations, before[0])
+
+
 class Grows(PPO):
     """Its policy has one more parameter after the first update."""
 
@@ -305,8 +350,9 @@ def test_models_keep_what_they_have_learned_before_an_error(algo, env, error, sa
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_model_that_could_not_come_back_is_found_out_at_its_first_update():
-    team = toy_team({"agent_0": Grows, "agent_1": PPO}, 2, **PPO_SMALL)
+@pytest.mark.parametrize("algo", [Grows, GrowsALayer])
+def test_a_model_that_could_not_come_back_is_found_out_at_its_first_update(algo):
+    team = toy_team({"agent_0": algo, "agent_1": PPO}, 2, **PPO_SMALL)
     with pytest.raises(RuntimeError, match=r"adds or removes parameters.* use jobs=1") as caught:
         team.learn(640)
     assert "joint step 8 " in notes(caught.value)
