@@ -86,14 +86,14 @@ def everything(team, callbacks):
     obs = team.get_env().reset()
     kept: dict[str, Any] = {"prediction": team.predict(obs, deterministic=True)[0]}
     for agent, model in team.agents.items():
-        stream = team._agents.rngs[agent]
+        rng = team._agents.rngs[agent]
         logged = {key: value for key, value in model.logger.name_to_value.items() if not key.startswith("time/")}
         kept[agent] = {
             "policy": dict(model.policy.state_dict()),
             "optimizer": model.policy.optimizer.state_dict(),
             "gradients": [parameter.grad for parameter in model.policy.parameters()],
             "training": [module.training for module in model.policy.modules()],
-            "stream": (stream._torch, stream._numpy.state),
+            "rng": (rng._torch, rng._numpy.state),
             "logged": logged,
             "counts": (model._n_updates, model.num_timesteps, model._current_progress_remaining),
             "where it is": (model._last_obs, model._last_episode_starts),
