@@ -11,15 +11,10 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters import lbf
-from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import act, check_advantages, check_same_course, train_save_load_evaluate
 
 TWO, THREE = "Foraging-2s-8x8-2p-2f-coop-v3", "Foraging-2s-10x10-3p-3f-v3"
 NORTH, WEST, LOAD = 1, 3, 5
-
-
-def act(env, *actions):
-    """Step with the agents' actions in their order."""
-    return env.step(dict(zip(env.possible_agents, actions, strict=True)))
 
 
 def placed(name, *players, food=((6, 6, 4),), **env_kwargs):
@@ -156,21 +151,13 @@ def test_advantages():
 @pytest.mark.parametrize("carry", [copy.deepcopy, lambda state: pickle.loads(pickle.dumps(state))])
 def test_state(carry):
     env, other = lbf.make(THREE, max_episode_steps=6), lbf.make(THREE, max_episode_steps=6)
-    rng = np.random.default_rng(1)
     env.reset(seed=5)
     act(env, 0, 1, 2)
     state = carry(env.get_state())
     other.set_state(state)
     state["game"]["field"][:] = 99  # The environment has copied the state that it was given
     assert other.agents and np.array_equal(list(other.visibility().values()), list(env.visibility().values()))
-    for _ in range(20):
-        if not env.agents:
-            pair: Any = env.reset(), other.reset()
-        else:
-            actions = rng.integers(6, size=3).tolist()
-            pair = act(env, *actions), act(other, *actions)
-            assert pair[0][1:4] == pair[1][1:4] and env.agents == other.agents
-        assert all(np.array_equal(pair[0][0][agent], pair[1][0][agent]) for agent in pair[0][0])
+    check_same_course(env, other, 20)
 
 
 def test_arguments():

@@ -10,15 +10,10 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters import rware
-from tests.envs.adapters.tuple_helpers import check_advantages, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import act, check_advantages, check_same_course, train_save_load_evaluate
 
 TWO, FOUR = "rware-tiny-2ag-v2", "rware-tiny-4ag-v2"
 LOAD = 4
-
-
-def act(env, *actions):
-    """Step with the agents' actions in their order."""
-    return env.step(dict(zip(env.possible_agents, actions, strict=True)))
 
 
 def in_the_observation(env, obs):
@@ -112,7 +107,6 @@ def test_advantages():
 
 def test_state():
     env, other = rware.make(FOUR, max_steps=40), rware.make(FOUR, max_steps=40)
-    rng = np.random.default_rng(1)
     env.reset(seed=5)
     for robot, shelf in zip(env.game.agents, env.game.shelfs, strict=False):
         robot.x, robot.y = shelf.x, shelf.y
@@ -120,14 +114,7 @@ def test_state():
     act(env, *[LOAD] * 4)
     assert all(robot.carrying_shelf for robot in env.game.agents)
     other.set_state(pickle.loads(pickle.dumps(env.get_state())))
-    for _ in range(30):
-        if not env.agents:
-            pair: Any = env.reset(), other.reset()
-        else:
-            actions = rng.integers(5, size=4).tolist()
-            pair = act(env, *actions), act(other, *actions)
-            assert pair[0][1:4] == pair[1][1:4] and env.agents == other.agents
-        assert all(np.array_equal(pair[0][0][agent], pair[1][0][agent]) for agent in pair[0][0])
+    check_same_course(env, other, 30)
 
 
 def test_observations_and_arguments():

@@ -20,6 +20,31 @@ def make_team(make_env: Callable[[], Any], n_steps: int, algorithm: Any = Belief
     return Team(algorithm, "BeliefPolicy", env, seed=0, n_steps=n_steps, policy_kwargs=POLICY_KWARGS, **{**SMALL, **kwargs})
 
 
+def act(env: Any, *actions: int) -> Any:
+    """Step with the agents' actions in their order."""
+    return env.step(dict(zip(env.possible_agents, actions, strict=True)))
+
+
+def check_same_course(env: Any, other: Any, n_steps: int) -> None:
+    """
+    Check that two environments in the same state give the same steps, beyond the ends of episodes.
+
+    :param env: One environment
+    :param other: The other one
+    :param n_steps: Number of steps and resets, with random actions
+    """
+    rng = np.random.default_rng(1)
+    n_actions = env.action_space(env.possible_agents[0]).n
+    for _ in range(n_steps):
+        if not env.agents:
+            pair: Any = env.reset(), other.reset()
+        else:
+            actions = rng.integers(n_actions, size=len(env.possible_agents)).tolist()
+            pair = act(env, *actions), act(other, *actions)
+            assert pair[0][1:4] == pair[1][1:4] and env.agents == other.agents
+        assert all(np.array_equal(pair[0][0][agent], pair[1][0][agent]) for agent in pair[0][0])
+
+
 def train_save_load_evaluate(make_env: Callable[[], Any], folder: Any, algorithm: Any = BeliefPPO) -> list:
     """
     Train a team for two short iterations, save it, load it, evaluate it and train it further.
