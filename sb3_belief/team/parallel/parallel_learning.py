@@ -44,19 +44,14 @@ def check_jobs(jobs: Any) -> int:
     return jobs
 
 
-def leaves_models_alone(callback: BaseCallback | None) -> bool:
+def find_own_callback(callback: BaseCallback | None) -> Any:
     """
-    Tell whether a team's callback uses the models through the team's own methods only, and changes nothing in them.
-
-    This holds for the callbacks of SB3 and sb3-contrib, if it holds for those that they call.
+    Find what a team's callback calls besides the callbacks of SB3 and sb3-contrib. Those use the models through the team's own
+    methods only, and change nothing in them.
 
     :param callback: Of a team
+    :return: The first callback or function of the user's own; None without one
     """
-    return _own_callback(callback) is None
-
-
-def _own_callback(callback: BaseCallback | None) -> Any:
-    """Return the first callback or function among those called that is not from SB3 or sb3-contrib; None without one."""
     if callback is None:
         return None
     if isinstance(callback, ConvertCallback):
@@ -67,7 +62,7 @@ def _own_callback(callback: BaseCallback | None) -> Any:
         *getattr(callback, "callbacks", []),
         *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
     ]
-    return next((own for own in map(_own_callback, called) if own is not None), None)
+    return next((own for own in map(find_own_callback, called) if own is not None), None)
 
 
 def can_learn_elsewhere(model: OnPolicyAlgorithm, loop: JointLoop, agent: str, task: AgentTask) -> bool:
@@ -172,7 +167,7 @@ class ParallelLearning:
         n_processes = min(self._jobs, len(models))
         if n_processes <= 1:
             return {}
-        own = _own_callback(callback)
+        own = find_own_callback(callback)
         if own is not None:
             name = getattr(own, "__name__", type(own).__name__)
             warnings.warn(

@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import (
 
 from sb3_belief import BeliefPPO
 from sb3_belief.team.parallel import workers
-from sb3_belief.team.parallel.parallel_learning import leaves_models_alone
+from sb3_belief.team.parallel.parallel_learning import find_own_callback
 from tests.team.helpers import Record, Team, make_team_env, parameters
 from tests.team.parallel.test_jobs import (
     EASY,
@@ -158,7 +158,7 @@ class Own(EvalCallback):
 )
 @pytest.mark.filterwarnings("ignore:Training and eval env")
 def test_which_callbacks_leave_models_alone(callback, expected):
-    assert leaves_models_alone(callback) == expected
+    assert (find_own_callback(callback) is None) == expected
 
 
 LOOKED_AT: dict[str, tuple[Any, dict[str, Any]]] = {
