@@ -19,7 +19,7 @@ from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
 from sb3_belief.belief_ppo.options import BeliefOptions
-from sb3_belief.common.tensor_version import TensorVersions
+from sb3_belief.common.kept_tensors import KeptTensors
 
 # The least height and width of which NatureCNN's convolutions leave anything
 _MIN_IMAGE_SIZE = 36
@@ -129,11 +129,11 @@ class BeliefExtractor(BaseFeaturesExtractor):
             for name, rows in history._asdict().items():
                 self.register_buffer(f"history_{name}", rows)
         self._context: HistoryContext | None = None
-        self._context_versions = TensorVersions()
+        self._context_inputs = KeptTensors()
 
     def __getstate__(self) -> dict[str, Any]:
         # The encoded history is made again where it is needed
-        return {**vars(self), "_context": None, "_context_versions": TensorVersions()}
+        return {**vars(self), "_context": None, "_context_inputs": KeptTensors()}
 
     @property
     def history(self) -> History | None:
@@ -215,7 +215,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :param history: The present one
         :return: The same as the network sees it, without gradients
         """
-        if self._context_versions.changed((*self.belief.context_parameters(), *history)) or self._context is None:
+        if self._context_inputs.changed((*self.belief.context_parameters(), *history)) or self._context is None:
             self._context = self.belief.encode_history(history)
         return self._context
 

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from torch.autograd.graph import increment_version
 from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, DynamicBelief, History, expected_actions, kl_divergence
@@ -31,18 +30,6 @@ def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
     chosen = optimizer_kwargs.keys() & {"fused", "foreach", "capturable", "differentiable"}
     return dict(optimizer_kwargs) if chosen else {**optimizer_kwargs, "fused": True}
-
-
-def _count_fused_step(optimizer: th.optim.Optimizer, *_: Any) -> None:
-    """
-    Increment the version counters of the weights after a step, which fused optimisers do not: what was computed from the
-    weights is stale (see ``TensorVersions``).
-
-    :param optimizer: Has made the step, of which this is the hook
-    """
-    for group in optimizer.param_groups:
-        for weights in group["params"] if group.get("fused") else ():
-            increment_version(weights)
 
 
 class _Unchecked:
@@ -105,12 +92,6 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         if self.optimizer_class is th.optim.Adam:
             self.optimizer_kwargs = _fused_adam_kwargs(self.optimizer_kwargs)
         super()._build(lr_schedule)
-        self.optimizer.register_step_post_hook(_count_fused_step)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        # A copied optimiser has no hooks
-        self.optimizer.register_step_post_hook(_count_fused_step)
 
     # -- what the algorithm and users call ------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """Which policies have networks that can be stacked."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from typing import Any
 
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
@@ -25,7 +25,6 @@ _COMPOSED = {nn.Sequential, nn.Flatten, FlattenExtractor, MlpExtractor, BeliefEx
 # Only activations whose result for a number is the same to the bit wherever it lies in a tensor: for the others PyTorch uses
 # vectorised code for most numbers and different code for the remainder
 _ACTIVATIONS = {nn.Identity, nn.Tanh, nn.ReLU, nn.LeakyReLU}
-_HOOKS = ("_forward_hooks", "_forward_pre_hooks")
 
 
 def signature(policy: nn.Module) -> Hashable | None:
@@ -39,9 +38,9 @@ def signature(policy: nn.Module) -> Hashable | None:
     if type(policy) not in _POLICIES or not policy.share_features_extractor:
         return None
     found: list[Any] = [type(policy), getattr(policy, "options", None)]
+    if has_hooks(policy.modules()):
+        return None
     for path, module in policy.named_modules():
-        if any(getattr(module, hooks) for hooks in _HOOKS):
-            return None
         if type(module) is nn.Linear:
             found.append((path, *((w.shape, w.dtype, w.device) for w in module.parameters())))
         elif type(module) in _ACTIVATIONS:
@@ -50,3 +49,12 @@ def signature(policy: nn.Module) -> Hashable | None:
         elif module is not policy and type(module) not in _COMPOSED:
             return None
     return tuple(found)
+
+
+def has_hooks(modules: Iterable[nn.Module]) -> bool:
+    """
+    Tell whether there is a hook that a pass would call.
+
+    :param modules: The modules of a policy
+    """
+    return any(module._forward_hooks or module._forward_pre_hooks for module in modules)

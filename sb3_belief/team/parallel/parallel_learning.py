@@ -15,19 +15,18 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.own_code import find_own_callback, runs_own_code
 from sb3_belief.team.parallel.model_state import modules_of, optimizers_of, pack
 from sb3_belief.team.parallel.remote_agents import RemoteAgents
 from sb3_belief.team.parallel.workers import Workers
 
-# Callbacks of these libraries use a model only to predict and to save it
-_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
@@ -42,27 +41,6 @@ def check_jobs(jobs: Any) -> int:
     if not isinstance(jobs, int) or isinstance(jobs, bool) or jobs < 1:
         raise ValueError(f"jobs is {jobs!r}; it must be a whole number of at least 1: the processes that work for the agents.")
     return jobs
-
-
-def find_own_callback(callback: BaseCallback | None) -> Any:
-    """
-    Find what a team's callback calls besides the callbacks of SB3 and sb3-contrib. Those use the models through the team's own
-    methods only, and change nothing in them.
-
-    :param callback: Of a team
-    :return: The first callback or function of the user's own; None without one
-    """
-    if callback is None:
-        return None
-    if isinstance(callback, ConvertCallback):
-        return callback.callback
-    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
-        return callback
-    called = [
-        *getattr(callback, "callbacks", []),
-        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
-    ]
-    return next((own for own in map(find_own_callback, called) if own is not None), None)
 
 
 def can_learn_elsewhere(model: OnPolicyAlgorithm, loop: JointLoop, agent: str, task: AgentTask) -> bool:
@@ -140,7 +118,10 @@ class ParallelLearning:
             self._groups = [
                 RemoteAgents(loop, self._workers, worker, group, self._rngs, learn) for worker, group in by_worker.items()
             ]
-            with batched_forwards(loop, {agent: model for agent, model in models.items() if agent not in away}):
+            here = {agent: model for agent, model in models.items() if agent not in away}
+            with batched_forwards(
+                loop, here, watches=runs_own_code([callback, *(task.callback for task in tasks.values())], here)
+            ):
                 yield self._groups
             for group in self._groups:
                 group.close()

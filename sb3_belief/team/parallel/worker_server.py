@@ -17,6 +17,7 @@ from sb3_belief.common.processes import leave_interrupts_to_main
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.own_code import runs_own_code
 from sb3_belief.team.parallel.group_scheduler import GroupScheduler
 from sb3_belief.team.parallel.messages import Message, dumps, loads, receive, send
 from sb3_belief.team.parallel.model_state import StateReader, unpack
@@ -179,7 +180,7 @@ class WorkerServer:
             self._readers[agent], self._rngs[agent] = StateReader(model), rng
             tasks[agent] = AgentTask(partial(learn, model), Predictor(model, model._vec_normalize_env).act, rng)
         self._unread = set(tasks)
-        self._stack.enter_context(batched_forwards(scheduler, self._models))
+        self._stack.enter_context(batched_forwards(scheduler, self._models, watches=runs_own_code([], self._models)))
         self._scheduler = scheduler
         scheduler.start(tasks)
 

@@ -1,5 +1,6 @@
 """Agents with equal networks act in one batched pass, and learn, draw and log the same to the bit as when each acts alone."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from sb3_contrib import MaskablePPO, RecurrentPPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import polyak_update
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy
@@ -122,12 +124,22 @@ class Hooked(BaseCallback):
 
     def _on_step(self):
         if self.n_calls == 12:
-            self.model.agents["agent_1"].policy.mlp_extractor.register_forward_hook(lambda *_: None)
+            network = self.model.agents["agent_1"].policy.mlp_extractor
+            network.register_forward_hook(lambda module, _, output: (output[0] * 2, output[1]))
         return True
 
 
+def replace_layers(module):
+    """Put copies of linear layers with other weights in their places, in a module."""
+    for name, layer in list(module.named_children()):
+        if isinstance(layer, th.nn.Linear):
+            other = copy.deepcopy(layer)
+            other.weight.mul_(0.5)
+            setattr(module, name, other)
+
+
 class Writes(BaseCallback):
-    """Callback of the team that changes agents' weights in the middle of rollouts, in five different ways."""
+    """Callback of the team that changes agents' weights in the middle of rollouts, in every way there is."""
 
     model: Any
 
@@ -141,6 +153,18 @@ class Writes(BaseCallback):
             layer.bias = th.nn.Parameter(layer.bias + 0.5)
         elif self.n_calls == 11:
             layer.weight.data = layer.weight + 0.5
+        elif self.n_calls == 4:
+            layer.weight.data.mul_(0.9)
+        elif self.n_calls == 5:
+            polyak_update(policies[1].parameters(), policies[2].parameters(), 0.7)
+        elif self.n_calls == 7:
+            layer.weight.detach().numpy()[0] = 0.1
+        elif self.n_calls == 9 and getattr(policies[0], "history", None) is not None:
+            policies[0].history.actions.data.zero_()
+            policies[1].history.observations.numpy()[:] *= 0.5
+        elif self.n_calls == 10:
+            # Another layer in its place
+            policies[1].mlp_extractor.apply(replace_layers)
         elif self.n_calls == 13:
             policies[1].load_state_dict(policies[2].state_dict())
         elif self.n_calls == 15:
@@ -151,6 +175,19 @@ class Writes(BaseCallback):
 @pytest.mark.parametrize("kwargs", [{}, {"algo": BeliefPPO, "policy": "BeliefPolicy", "history_length": 20, **PPO_KWARGS}])
 def test_weights_that_are_changed_within_a_rollout_count_at_once(kwargs, monkeypatch, sizes):
     assert learn_both_ways(monkeypatch, sizes, callback=Writes, **kwargs) == [3] * 24
+
+
+class Perturbs(PPO):
+    """An algorithm of the user's own that changes its weights within rollouts."""
+
+    def _update_info_buffer(self, infos, dones=None):
+        super()._update_info_buffer(infos, dones)
+        for weights in self.policy.mlp_extractor.parameters():
+            weights.data.mul_(1.01)
+
+
+def test_an_algorithm_of_ones_own_may_change_weights_within_a_rollout(monkeypatch, sizes):
+    assert learn_both_ways(monkeypatch, sizes, algo=Perturbs, **PPO_KWARGS) == [3] * 24
 
 
 class MyPolicy(ActorCriticPolicy):
@@ -176,8 +213,8 @@ def test_those_of_one_kind_act_together(monkeypatch, sizes):
     assert learn_both_ways(monkeypatch, sizes, agent_kwargs=shape) == [2] * 24
     two = {f"agent_{i}": {"policy_kwargs": {"net_arch": [64]}} for i in (1, 3)}
     assert learn_both_ways(monkeypatch, sizes, env_id=lambda: ToyEnv(4), agent_kwargs=two) == [2] * 48
-    # The agent acts alone from the rollout after the one in which it gets the hook
-    assert learn_both_ways(monkeypatch, sizes, callback=Hooked) == [3] * 16 + [2] * 8
+    # The agent acts alone from the step on at which it gets the hook, which changes what it does
+    assert learn_both_ways(monkeypatch, sizes, callback=Hooked) == [3] * 12 + [2] * 12
 
 
 def test_who_has_a_callback_acts_alone(sizes):
@@ -221,6 +258,6 @@ def make_policies(n):
 
 def test_a_policy_unlike_any_of_sb3_acts_by_itself():
     with th.no_grad():
-        assert not ForwardRequest(th.nn.Linear(2, 2)).accepts(th.zeros(1, 2))
-        assert ForwardRequest(make_policies(1)[0]).accepts(th.zeros(1, 6))
-    assert not ForwardRequest(make_policies(1)[0]).accepts(th.zeros(1, 6))
+        assert not ForwardRequest(th.nn.Linear(2, 2), watches=False).accepts(th.zeros(1, 2))
+        assert ForwardRequest(make_policies(1)[0], watches=False).accepts(th.zeros(1, 6))
+    assert not ForwardRequest(make_policies(1)[0], watches=False).accepts(th.zeros(1, 6))

@@ -21,8 +21,8 @@ from stable_baselines3.common.callbacks import (
 )
 
 from sb3_belief import BeliefPPO
+from sb3_belief.team.own_code import find_own_callback
 from sb3_belief.team.parallel import workers
-from sb3_belief.team.parallel.parallel_learning import find_own_callback
 from tests.team.helpers import Record, Team, make_team_env, parameters
 from tests.team.parallel.test_jobs import (
     EASY,

@@ -1,0 +1,44 @@
+"""Code of the user's own that runs while a team learns, and may look at its models or change them at any step."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+
+# Callbacks of these libraries use a model only to predict and to save it
+_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
+
+
+def find_own_callback(callback: BaseCallback | None) -> Any:
+    """
+    Find what a team's callback calls besides the callbacks of SB3 and sb3-contrib. Those use the models through the team's own
+    methods only, and change nothing in them.
+
+    :param callback: Of a team
+    :return: The first callback or function of the user's own; None without one
+    """
+    if callback is None:
+        return None
+    if isinstance(callback, ConvertCallback):
+        return callback.callback
+    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
+        return callback
+    called = [
+        *getattr(callback, "callbacks", []),
+        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
+    ]
+    return next((own for own in map(find_own_callback, called) if own is not None), None)
+
+
+def runs_own_code(callbacks: Iterable[BaseCallback | None], models: Mapping[str, BaseAlgorithm]) -> bool:
+    """
+    Tell whether code of the user's own runs within rollouts.
+
+    :param callbacks: Of the team and of its agents
+    :param models: The models that act, by agent
+    :return: True for a callback or an algorithm that is not from SB3, sb3-contrib or this package
+    """
+    known = {*_LIBRARIES, __name__.partition(".")[0]}
+    own = [m for m in models.values() if type(m).__module__.partition(".")[0] not in known]
+    return any(find_own_callback(callback) is not None for callback in callbacks) or bool(own)
