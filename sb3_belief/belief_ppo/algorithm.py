@@ -147,13 +147,17 @@ class BeliefAlgorithmMixin(_Algorithm):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         # SB3 calls this once a step, after the callbacks and before it bootstraps time limits and adds the step to the buffer
         super()._update_info_buffer(infos, dones)
-        if dones is not None and dones.any():
-            self.policy.attach_terminal_values(infos, dones)
-        active = np.ones(self.n_envs, dtype=bool)
         # SB3 accepts environments that return fewer infos than copies
+        active, next_active = np.ones((2, self.n_envs), dtype=bool)
         active[: len(infos)] = [info.get("active", True) for info in infos]
+        next_active[: len(infos)] = [info.get("next_active", True) for info in infos]
+        if dones is not None and dones.any():
+            for copy in np.flatnonzero(dones[: len(infos)] & ~next_active[: len(infos)]):
+                # The critic has no opinion of an agent that is out of play at the limit
+                infos[copy]["TimeLimit.truncated"] = False
+            self.policy.attach_terminal_values(infos, dones)
         others = read_others(infos, self.policy.layout) if self.policy.has_belief else ()
-        self.rollout_buffer.stage(active, *others)
+        self.rollout_buffer.stage(active, next_active, *others)
 
     # -- update --------------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief import ActionLayout
+from sb3_belief.belief_ppo.cut_returns import CutReturns
 
 Carrier = TypeVar("Carrier")
 
@@ -157,6 +158,7 @@ class BeliefBufferMixin(_Buffer):
         # Before SB3's constructor, which calls reset()
         self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
         super().__init__(*args, **kwargs)
+        self._cut_returns = CutReturns(self.n_envs, self.gamma)
 
     def reset(self) -> None:
         super().reset()
@@ -166,20 +168,28 @@ class BeliefBufferMixin(_Buffer):
         self.others_actions = np.zeros((*rows, self._widths["others_actions"]), dtype=np.float32)
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
         self.active = np.ones(rows, dtype=bool)
+        # Whether it is in play at the observation after the last step
+        self._next_active = np.ones(self.n_envs, dtype=bool)
         # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
         self._n_selected = 0
 
     def stage(
-        self, active: np.ndarray, others_actions: np.ndarray | None = None, others_visible: np.ndarray | None = None
+        self,
+        active: np.ndarray,
+        next_active: np.ndarray | bool = True,
+        others_actions: np.ndarray | None = None,
+        others_visible: np.ndarray | None = None,
     ) -> None:
         """
         Write what the environment says of a step into the row that ``add`` fills next.
 
         :param active: Whether the agent was in play when it acted, bool ``[n_envs]``
+        :param next_active: Whether it is in play after the step, bool ``[n_envs]``
         :param others_actions: float32 ``[n_envs, W]``, zero where not visible; None without a belief
         :param others_visible: bool ``[n_envs, n_others]``; None without a belief
         """
         self.active[self.pos] = active
+        self._next_active[:] = next_active
         if others_actions is not None and others_visible is not None:
             self.others_actions[self.pos] = others_actions
             self.others_visible[self.pos] = others_visible
@@ -200,43 +210,72 @@ class BeliefBufferMixin(_Buffer):
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
         """
-        Compute returns as SB3 does, except that the value of an inactive step is what it went on to earn: the critic is never
-        trained there, so its opinion must not enter the advantage of the steps before.
+        Compute returns as SB3 does, except that the critic has no opinion of inactive steps, on which it is never trained.
+
+        The value of an inactive step is what it went on to earn. If the rollout ends while the agent is out of play, this is
+        not known, and :class:`~sb3_belief.belief_ppo.cut_returns.CutReturns` estimates the return of its last active step.
 
         :param last_values: Values of the observations after the last step, ``[n_envs]``
         :param dones: Whether the agent's return ended with the last step, ``[n_envs]``
         """
-        if not self.active.all():
-            next_values, goes_on = last_values.clone().cpu().numpy().flatten(), 1.0 - dones.astype(np.float32)
-            for step in reversed(range(self.buffer_size)):
-                earned = self.rewards[step] + self.gamma * goes_on * next_values
-                self.values[step] = np.where(self.active[step], self.values[step], earned)
-                next_values, goes_on = self.values[step], 1.0 - self.episode_starts[step]
-        super().compute_returns_and_advantage(last_values, dones)
+        dones = np.asarray(dones, dtype=bool)
+        starts = self.episode_starts.astype(bool)
+        away = ~dones & ~(self.active[-1] & self._next_active)
+        if self.active.all() and not away.any():
+            self._cut_returns.forget()
+            return super().compute_returns_and_advantage(last_values, dones)
+        ends = np.concatenate([starts[1:], dones[None]])
+        steps, copies, expected = self._cut_returns.estimate(self.rewards, self.values, self.active, starts, ends, away)
+        next_values = last_values.clone().cpu().numpy().flatten()
+        for step in reversed(range(self.buffer_size)):
+            earned = self.rewards[step] + self.gamma * ~ends[step] * next_values
+            self.values[step] = np.where(self.active[step], self.values[step], earned)
+            next_values = self.values[step]
+        # As if the agent had been paid the expected return there, at the end of an episode
+        rewards, self.rewards = self.rewards, self.rewards.copy()
+        self.rewards[steps, copies], ends[steps, copies] = expected, True
+        self.episode_starts[1:] = ends[:-1]
+        super().compute_returns_and_advantage(last_values, ends[-1])
+        self.rewards, self.episode_starts[1:] = rewards, starts[1:]
 
     def recent(self, n_rows: int) -> tuple[np.ndarray | dict[str, np.ndarray], np.ndarray]:
         """
         Return the last active steps of all copies, interleaved by time.
 
-        It must be called before :meth:`get`, which reorders the rows.
-
         :param n_rows: The most rows to return
         :return: The observations of these steps and the others' actions, oldest first
-        :raises RuntimeError: If called after :meth:`get`
         """
-        if self.generator_ready:
-            raise RuntimeError("recent() must be called before the first get() of an update: that reorders the rows")
-        rows = np.flatnonzero(self.active.reshape(-1))[-n_rows:]
+        rows = self.rows_of(self.active_steps()[-n_rows:])
 
         def pick(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
             # As the environment gives them: SB3 keeps a Discrete observation as an array of one number
-            return array.reshape(-1, *array.shape[2:])[rows].reshape(len(rows), *shape)
+            return array[rows].reshape(len(rows[0]), *shape)
 
-        actions = pick(self.others_actions, self.others_actions.shape[2:])
+        actions = pick(self.others_actions, (self._widths["others_actions"],))
         observations, space = self.observations, self.observation_space
         if isinstance(observations, dict) and isinstance(space, spaces.Dict):
             return {key: pick(part, space[key].shape or ()) for key, part in observations.items()}, actions
         return pick(observations, space.shape or ()), actions
+
+    def active_steps(self) -> np.ndarray:
+        """
+        Return the numbers of the active steps, counted through all copies at each time.
+
+        :return: int ``[N]``, ascending: step t of copy e has the number ``t * n_envs + e``
+        """
+        numbers = np.arange(self.buffer_size * self.n_envs)
+        return numbers[self.active[self.rows_of(numbers)]]
+
+    def rows_of(self, steps: np.ndarray) -> tuple[np.ndarray, ...]:
+        """
+        Return where steps lie in the arrays at present. The first :meth:`get` after a rollout, which may be a callback's, puts
+        the copies one after the other.
+
+        :param steps: Numbers of steps, see :meth:`active_steps`
+        :return: Index into the first one or two dimensions of the arrays
+        """
+        times, copies = np.divmod(steps, self.n_envs)
+        return (copies * self.buffer_size + times,) if self.generator_ready else (times, copies)
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """

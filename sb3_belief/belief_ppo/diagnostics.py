@@ -36,9 +36,8 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         ``first_log_ratio``, largest ``|log ratio|`` of the policies that acted and that is trained: 0 but for rounding.
         Measures of parts that a belief does not have (a prediction, a sampled latent, attention) are left out
     """
-    rows = np.flatnonzero(buffer.active)
-    rows = rows[np.linspace(0, len(rows) - 1, min(PROBE_ROWS, len(rows))).astype(int)]
-    step = np.unravel_index(rows, buffer.active.shape)
+    steps = buffer.active_steps()
+    step = buffer.rows_of(steps[np.linspace(0, len(steps) - 1, min(PROBE_ROWS, len(steps))).astype(int)])
     minibatch = buffer.belief_minibatch(step)
     raw = buffer.observations
     observations = obs_as_tensor({k: v[step] for k, v in raw.items()} if isinstance(raw, dict) else raw[step], policy.device)
@@ -96,7 +95,7 @@ def _first_log_ratio(
     if isinstance(buffer, (MaskableRolloutBuffer, MaskableDictRolloutBuffer)):
         masks["action_masks"] = buffer.to_torch(buffer.action_masks[step])
     _, log_prob, _ = policy.evaluate_actions(attach(observations, minibatch), actions, **masks)
-    return float((log_prob - buffer.to_torch(buffer.log_probs[step])).abs().max())
+    return float((log_prob - buffer.to_torch(buffer.log_probs[step]).flatten()).abs().max())
 
 
 def _accuracies(prediction: th.Tensor, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:
