@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
@@ -38,8 +39,9 @@ class BeliefAlgorithmMixin(_Algorithm):
 
     #: Name of SB3's algorithm without the belief, for messages
     stock: ClassVar[str]
-    #: Base class of the policies, and the rollout buffers for plain and for Dict observations
+    #: Base class of the policies, with a belief and without, and the rollout buffers for plain and for Dict observations
     policy_base: ClassVar[type[BeliefPolicyMixin]]
+    stock_policy: ClassVar[type[BasePolicy]]
     buffer_classes: ClassVar[tuple[type[BeliefBufferMixin], type[BeliefBufferMixin]]]
 
     policy: BeliefPolicyMixin
@@ -71,6 +73,10 @@ class BeliefAlgorithmMixin(_Algorithm):
         self.others_action_spaces = {} if self.env is None or options.variant is None else others_of(self.env)
 
     @property
+    def _has_belief(self) -> bool:
+        return isinstance(self.policy, self.policy_base) and self.policy.has_belief
+
+    @property
     def _options(self) -> BeliefOptions:
         return BeliefOptions(**{field.name: getattr(self, field.name) for field in fields(BeliefOptions)})
 
@@ -83,7 +89,9 @@ class BeliefAlgorithmMixin(_Algorithm):
                     f"{type(self).__name__} is {self.stock} here. Train a Team, or bring 'others_action_spaces'.",
                     stacklevel=3,
                 )
-        if not issubclass(self.policy_class, self.policy_base):
+        # Without a belief there is nothing that SB3's own policies lack
+        without_belief = self.belief == "none" or not self.others_action_spaces
+        if not issubclass(self.policy_class, self.stock_policy if without_belief else self.policy_base):
             raise ValueError(
                 f"{type(self).__name__} needs a policy with a belief, not {self.policy_class.__name__}; use 'BeliefPolicy' or "
                 f"derive yours from sb3_belief.belief_ppo.{self.policy_base.__name__}"
@@ -97,11 +105,12 @@ class BeliefAlgorithmMixin(_Algorithm):
                 f"rollout_buffer_class is {self.rollout_buffer_class.__name__}, which has no place for what a belief is "
                 f"trained on; derive it from sb3_belief.belief_ppo.{plain.__name__} (or {for_dicts.__name__})"
             )
-        self.policy_kwargs = {
-            **self.policy_kwargs,
-            "others_action_spaces": self.others_action_spaces,
-            **asdict(self._options),
-        }
+        if issubclass(self.policy_class, self.policy_base):
+            self.policy_kwargs = {
+                **self.policy_kwargs,
+                "others_action_spaces": self.others_action_spaces,
+                **asdict(self._options),
+            }
         self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, **self._buffer_widths()}
         try:
             super()._setup_model()
@@ -155,8 +164,9 @@ class BeliefAlgorithmMixin(_Algorithm):
             for copy in np.flatnonzero(dones[: len(infos)] & ~next_active[: len(infos)]):
                 # The critic has no opinion of an agent that is out of play at the limit
                 infos[copy]["TimeLimit.truncated"] = False
-            self.policy.attach_terminal_values(infos, dones)
-        others = read_others(infos, self.policy.layout) if self.policy.has_belief else ()
+            if isinstance(self.policy, self.policy_base):
+                self.policy.attach_terminal_values(infos, dones)
+        others = read_others(infos, self.policy.layout) if self._has_belief else ()
         self.rollout_buffer.stage(active, next_active, *others)
 
     # -- update --------------------------------------------------------------------------------------------------------
@@ -171,7 +181,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         buffer, policy = self.rollout_buffer, self.policy
         # The advantages of a single step cannot be normalised
         learns = buffer.active.sum() > 1 or (buffer.active.all() and not self.normalize_advantage)
-        if not policy.has_belief or not buffer.active.any():
+        if not self._has_belief or not buffer.active.any():
             if learns:
                 self._update()
             return

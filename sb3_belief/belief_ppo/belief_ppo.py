@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_belief.belief_ppo.algorithm import BeliefAlgorithmMixin, refuse_many_agents
@@ -31,7 +31,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     Steps with ``active=False`` in ``info`` are left out of loss, advantage statistics and history.
 
     :param policy: ``"BeliefPolicy"``, whose features extractor fits the observation space, one of SB3's names ``"MlpPolicy"``,
-        ``"CnnPolicy"``, ``"MultiInputPolicy"``, or a class derived from :class:`~sb3_belief.BeliefActorCriticPolicy`
+        ``"CnnPolicy"``, ``"MultiInputPolicy"``, or a class derived from :class:`~sb3_belief.BeliefActorCriticPolicy`;
+        without a belief also one of SB3's own
     :param env: The environment of this one agent
     :param learning_rate: As in PPO
     :param n_steps: As in PPO
@@ -79,6 +80,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
 
     stock = "PPO"
     policy_base = BeliefActorCriticPolicy
+    stock_policy = ActorCriticPolicy
     buffer_classes = (BeliefRolloutBuffer, BeliefDictRolloutBuffer)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "BeliefPolicy": BeliefActorCriticPolicy,

@@ -34,7 +34,8 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
         ``visible_fraction``, share of the others that are visible;
         ``first_log_ratio``, largest ``|log ratio|`` of the policies that acted and that is trained: 0 but for rounding.
-        Measures of parts that a belief does not have (a prediction, a sampled latent, attention) are left out
+        Measures of parts that a belief or its policy does not have (a prediction, a sampled latent, attention, our fusion) are
+        left out
     """
     steps = buffer.active_steps()
     step = buffer.rows_of(steps[np.linspace(0, len(steps) - 1, min(PROBE_ROWS, len(steps))).astype(int)])
@@ -45,13 +46,14 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
 
     belief, variant = policy.belief, policy.options.variant
     assert belief is not None and variant is not None
-    assert isinstance(policy.mlp_extractor, BeliefFusion) and isinstance(policy.features_extractor, BeliefExtractor)
+    assert isinstance(policy.features_extractor, BeliefExtractor)
     measured = dict(
         visible_fraction=float(minibatch.others_visible.float().mean()),
-        fusion_ratio=policy.mlp_extractor.belief_share(),
         first_log_ratio=_first_log_ratio(policy, buffer, step, observations, minibatch),
         history_gain=0.0,
     )
+    if isinstance(policy.mlp_extractor, BeliefFusion):
+        measured["fusion_ratio"] = policy.mlp_extractor.belief_share()
     # The rollout has encoded the history already
     output = policy.features_extractor.infer(flat, minibatch.noise, minibatch.selected)
     if variant.samples:

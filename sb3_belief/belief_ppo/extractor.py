@@ -99,7 +99,8 @@ class BeliefFeatures(NamedTuple):
 
 class BeliefExtractor(BaseFeaturesExtractor):
     """
-    Features of the observation and, beside them, the belief about the others: :class:`BeliefFeatures`.
+    Features of the observation and, beside them, the belief about the others: :class:`BeliefFeatures`; or both in one tensor,
+    for a policy whose class overrides ``_build_mlp_extractor`` with another network than :class:`BeliefFusion`.
 
     The history belongs to the weights: it is kept in buffers, and so is saved, loaded and moved with the policy.
 
@@ -108,6 +109,9 @@ class BeliefExtractor(BaseFeaturesExtractor):
     :param belief: The belief network
     :param options: The user's options of the belief
     """
+
+    #: Whether features and belief are returned in one tensor
+    in_one_tensor = False
 
     history_observations: th.Tensor
     history_actions: th.Tensor
@@ -153,13 +157,15 @@ class BeliefExtractor(BaseFeaturesExtractor):
             history = append_rows(self.history, observations, actions)
             self.history_observations, self.history_actions, self.history_valid = history
 
-    def forward(self, observations: th.Tensor | TensorDict, belief_pass: BeliefPass | None = None) -> BeliefFeatures:
+    def forward(
+        self, observations: th.Tensor | TensorDict, belief_pass: BeliefPass | None = None
+    ) -> BeliefFeatures | th.Tensor:
         """
         Infer the belief and extract the features.
 
         :param observations: Preprocessed observations
         :param belief_pass: How to draw the belief; None for its mean
-        :return: Features and belief
+        :return: Features and belief, as of :meth:`with_belief`
         """
         belief_pass = belief_pass or BeliefPass()
         flat = flatten_observation(observations)
@@ -179,17 +185,18 @@ class BeliefExtractor(BaseFeaturesExtractor):
         """
         return th.randn(len(flat), self.belief.latent_dim, device=flat.device) if self.belief.variant.samples else None
 
-    def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures:
+    def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures | th.Tensor:
         """
         Put the belief beside the features.
 
         :param own: Features of the observation
         :param output: The belief
-        :return: Both, the belief as the options want it
+        :return: Both, the belief as the options want it; in one tensor ``[B, features_dim]`` if ``in_one_tensor``
         """
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
         latent = output.latent if self.options.policy_latent == "sample" else output.mean
-        return BeliefFeatures(own, latent.detach() if self.options.detach_belief else latent)
+        features = BeliefFeatures(own, latent.detach() if self.options.detach_belief else latent)
+        return th.cat(features, dim=-1) if self.in_one_tensor else features
 
     def infer(
         self, flat: th.Tensor, noise: th.Tensor | None = None, selected: th.Tensor | None = None, predict: bool = True

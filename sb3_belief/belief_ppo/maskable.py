@@ -100,6 +100,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
 
     stock = "MaskablePPO"
     policy_base = MaskableBeliefActorCriticPolicy
+    stock_policy = MaskableActorCriticPolicy
     buffer_classes = (MaskableBeliefRolloutBuffer, MaskableBeliefDictRolloutBuffer)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "BeliefPolicy": MaskableBeliefActorCriticPolicy,

@@ -97,6 +97,9 @@ class BeliefNetworksMixin(_Policy):
             return features
         # From a copy of the generator: with the same seed, all variants of a belief start with equal weights in the rest
         with th.random.fork_rng(devices=[]):
+            if not self.ortho_init:
+                # Nothing else draws the rest anew, whose first layer would start with the very weights of the belief's
+                th.manual_seed(int(th.randint(2**62, ())))
             belief = DynamicBelief(
                 get_flattened_obs_dim(self.observation_space),
                 self.layout.width,
@@ -121,6 +124,12 @@ class BeliefNetworksMixin(_Policy):
             self.fusion_activation_fn,
             self.device,
         )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        if isinstance(self.features_extractor, BeliefExtractor):
+            # A network of the user's own takes one tensor, as wide as features_dim says
+            self.features_extractor.in_one_tensor = not isinstance(self.mlp_extractor, BeliefFusion)
 
     def init_weights(self, module: nn.Module, gain: float = 1) -> None:  # type: ignore[override]
         """

@@ -123,15 +123,18 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         """
         if self.history is None:
             return
-        # obs_to_tensor() accepts images with the channels last, as the environment returns them
-        rows = self.flat_observations(self.obs_to_tensor(observations)[0])
-        if actions.shape != (len(rows), self.layout.width):
-            raise ValueError(
-                f"the others' actions have the shape {actions.shape}; {len(rows)} steps beside "
-                f"{', '.join(self.others_action_spaces)} need {(len(rows), self.layout.width)}, coded as in the environment's "
-                "info['others_actions']: one-hot for Discrete and each dimension of MultiDiscrete, else the values"
-            )
-        self._extractor.remember(rows, th.as_tensor(actions, device=self.device))
+        # A tensor that is made in inference mode could never be trained on
+        with th.inference_mode(False), th.no_grad():
+            # obs_to_tensor() accepts images with the channels last, as the environment returns them
+            rows = self.flat_observations(self.obs_to_tensor(observations)[0])
+            if actions.shape != (len(rows), self.layout.width):
+                raise ValueError(
+                    f"the others' actions have the shape {actions.shape}; {len(rows)} steps beside "
+                    f"{', '.join(self.others_action_spaces)} need {(len(rows), self.layout.width)}, coded as in the "
+                    "environment's info['others_actions']: one-hot for Discrete and each dimension of MultiDiscrete, else the "
+                    "values"
+                )
+            self._extractor.remember(rows, th.as_tensor(actions, device=self.device))
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
