@@ -1,5 +1,6 @@
 """The part of BeliefPPO and MaskableBeliefPPO that they have in common."""
 
+import sys
 import warnings
 from dataclasses import asdict, fields
 from numbers import Real
@@ -7,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -219,7 +219,9 @@ def refuse_many_agents(env: Any, algorithm: str) -> None:
     :param algorithm: Name of the algorithm
     :raises TypeError: If it is an environment of many agents
     """
-    is_pettingzoo = isinstance(env, (ParallelEnv, AECEnv))
+    # Not imported here, because a deployed agent does without it: as long as nobody has imported it, nothing is of its classes
+    pettingzoo: Any = sys.modules.get("pettingzoo")
+    is_pettingzoo = pettingzoo is not None and isinstance(env, (pettingzoo.ParallelEnv, pettingzoo.AECEnv))
     if is_pettingzoo or (isinstance(env, VecEnv) and hasattr(env, "possible_agents")):
         raise TypeError(
             f"{algorithm} trains one agent, but {type(env).__name__} is an environment of many. To train one model per agent "

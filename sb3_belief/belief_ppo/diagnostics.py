@@ -5,7 +5,6 @@ import math
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer, MaskableRolloutBuffer
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_belief.belief import ActionLayout, kl_divergence
@@ -94,7 +93,8 @@ def _first_log_ratio(
     if isinstance(policy.action_space, spaces.Discrete):
         actions = actions.long().flatten()
     masks = {}
-    if isinstance(buffer, (MaskableRolloutBuffer, MaskableDictRolloutBuffer)):
+    # sb3-contrib's, which is not imported for the others
+    if hasattr(buffer, "action_masks"):
         masks["action_masks"] = buffer.to_torch(buffer.action_masks[step])
     _, log_prob, _ = policy.evaluate_actions(attach(observations, minibatch), actions, **masks)
     return float((log_prob - buffer.to_torch(buffer.log_probs[step]).flatten()).abs().max())
