@@ -1,7 +1,7 @@
 """What a model knows of the others: their action spaces, and where their actions stand in one vector."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -42,6 +42,70 @@ def action_layout(others_action_spaces: Mapping[str, spaces.Space]) -> ActionLay
     """
     encodings = [action_encoding(name, space) for name, space in others_action_spaces.items()]
     return ActionLayout([encoding.widths for encoding in encodings], [encoding.kind for encoding in encodings])
+
+
+def others_rows(
+    others_action_spaces: Mapping[str, spaces.Space], actions: Any, visible: Mapping[str, Any] | None, n_steps: int
+) -> np.ndarray:
+    """
+    Return the others' actions of some steps as the rows of a history hold them.
+
+    :param others_action_spaces: The others' action spaces, in their fixed order
+    :param actions: Their actions by name, each ``[N, ...]`` in its own space, without the others that were not visible at all;
+        or rows as in ``info["others_actions"]``, ``[N, W]``
+    :param visible: At which steps each of them was visible, bool ``[N]`` by name; at all if it is left out
+    :param n_steps: ``N``
+    :return: float32 ``[N, W]``, zero where not visible
+    :raises ValueError: If a name is unknown, or actions or flags have another shape or are none of their space
+    """
+    layout, visible = action_layout(others_action_spaces), visible or {}
+    names = ", ".join(others_action_spaces)
+    for name in (*(actions if isinstance(actions, Mapping) else ()), *visible):
+        if name not in others_action_spaces:
+            raise ValueError(f"{name!r} is none of the others that the belief is about: {names}")
+    for name, flags in visible.items():
+        if np.shape(flags) != (n_steps,) or np.asarray(flags).dtype != bool:
+            raise ValueError(
+                f"visible[{name!r}] is {np.asarray(flags).dtype} of the shape {np.shape(flags)}; it must be one truth value "
+                f"for each of the {n_steps} steps"
+            )
+    if isinstance(actions, Mapping):
+        rows = np.zeros((n_steps, layout.width), dtype=np.float32)
+    else:
+        rows = np.array(actions, dtype=np.float32)
+        if rows.shape != (n_steps, layout.width):
+            raise ValueError(
+                f"the others' actions have the shape {rows.shape}; {n_steps} steps beside {names} need "
+                f"{(n_steps, layout.width)}, coded as in the environment's info['others_actions']: one-hot for Discrete and "
+                "each dimension of MultiDiscrete, else the values. Or give each other's actions by its name, in its own space"
+            )
+    for owner, (name, space) in enumerate(others_action_spaces.items()):
+        columns, seen = layout.columns_of(owner), np.asarray(visible.get(name, np.ones(n_steps, dtype=bool)))
+        if not isinstance(actions, Mapping):
+            rows[~seen, columns] = 0
+        elif name in actions:
+            rows[seen, columns] = _encoded(name, space, actions[name], seen)
+    return rows
+
+
+def _encoded(name: str, space: spaces.Space, actions: Any, seen: np.ndarray) -> np.ndarray:
+    """Encode those of an other's actions that were seen, ``[n_seen, width]``."""
+    values = np.asarray(actions)
+    if len(seen) == 1 and values.shape == space.shape:
+        values = values[None]
+    if values.shape != (len(seen), *(space.shape or ())):
+        raise ValueError(
+            f"the actions of {name!r} have the shape {values.shape}; {len(seen)} steps in {space} need "
+            f"{(len(seen), *(space.shape or ()))}"
+        )
+    rows = np.zeros((int(seen.sum()), spaces.flatdim(space)), dtype=np.float32)
+    for row, value in zip(rows, values[seen], strict=True):
+        # Bounds of numbers are not checked: others may act beyond them, which their environment clips
+        fits = np.isfinite(value).all() if isinstance(space, spaces.Box) else space.contains(value)
+        if not fits:
+            raise ValueError(f"{value!r} is no action of {name!r}, whose space is {space}")
+        row[:] = np.asarray(spaces.flatten(space, value))
+    return rows
 
 
 def others_of(env: VecEnv) -> ActionSpaces:

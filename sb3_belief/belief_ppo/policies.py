@@ -17,7 +17,7 @@ from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, DynamicBelief, Histor
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass, flat_observations
 from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
-from sb3_belief.belief_ppo.others import OthersPrediction
+from sb3_belief.belief_ppo.others import OthersPrediction, others_rows
 
 
 def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -110,7 +110,12 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
 
-    def remember(self, observations: np.ndarray | dict[str, np.ndarray], actions: np.ndarray) -> None:
+    def remember(
+        self,
+        observations: np.ndarray | dict[str, np.ndarray],
+        actions: np.ndarray | Mapping[str, Any],
+        visible: Mapping[str, Any] | None = None,
+    ) -> None:
         """
         Append the agent's own active steps to its history, which is all that it needs to adapt to other teammates.
 
@@ -118,8 +123,12 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         nothing.
 
         :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
-        :param actions: The others' flattened actions at these steps, ``[N, W]``, zero where not visible
-        :raises ValueError: If the actions are not of this shape
+        :param actions: What the others did at these steps: ``{name: actions}``, each ``[N, ...]`` in that other's own space,
+            without the others that were not visible at any; or all flattened and side by side, ``[N, W]``, zero where not
+            visible, as in ``info["others_actions"]``
+        :param visible: ``{name: bool [N]}``, at which of the steps each other was visible; at all of them if it is left out.
+            What stands in ``actions`` at the other steps is ignored
+        :raises ValueError: If a name is unknown, or something is not of this shape or no action of its space
         """
         if self.history is None:
             return
@@ -127,14 +136,8 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         with th.inference_mode(False), th.no_grad():
             # obs_to_tensor() accepts images with the channels last, as the environment returns them
             rows = self.flat_observations(self.obs_to_tensor(observations)[0])
-            if actions.shape != (len(rows), self.layout.width):
-                raise ValueError(
-                    f"the others' actions have the shape {actions.shape}; {len(rows)} steps beside "
-                    f"{', '.join(self.others_action_spaces)} need {(len(rows), self.layout.width)}, coded as in the "
-                    "environment's info['others_actions']: one-hot for Discrete and each dimension of MultiDiscrete, else the "
-                    "values"
-                )
-            self._extractor.remember(rows, th.as_tensor(actions, device=self.device))
+            encoded = others_rows(self.others_action_spaces, actions, visible, len(rows))
+            self._extractor.remember(rows, th.as_tensor(encoded, device=self.device))
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
