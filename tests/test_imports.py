@@ -13,7 +13,7 @@ LAYERS = [
     {"belief_ppo", "vec_env"},
     {"envs"},
     {"team"},
-    {"report"},
+    {"report", "export"},
     {"zoo"},
 ]
 LEVEL = {package: level for level, packages in enumerate(LAYERS) for package in packages}

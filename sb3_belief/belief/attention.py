@@ -45,7 +45,8 @@ def topk_indices(values: th.Tensor, n: int) -> th.Tensor:
     :param n: How many, at most T
     :return: Their indices in ascending order, int32 ``[..., n]``
     """
-    if n == 0 or values.device.type != "cpu":
+    # A graph that is being exported consists of PyTorch's operations
+    if n == 0 or values.device.type != "cpu" or th.compiler.is_compiling():
         return values.topk(n, dim=-1, sorted=False).indices.int().sort(dim=-1).values
     # A third of the time of topk()
     columns = np.argpartition(values.detach().numpy(), -n, axis=-1)[..., -n:].astype(np.int32)
@@ -71,6 +72,8 @@ def attend(queries: th.Tensor, keys: th.Tensor, values: th.Tensor, selected: th.
         raise ValueError(f"{selected.shape[-1]} rows are selected from a history of {n_rows}; select at most as many")
     if selected.numel() == 0:
         return queries.new_zeros(*queries.shape[:-1], values.shape[-1]), queries.new_zeros(selected.shape)
+    if th.compiler.is_compiling():
+        return reference_attention(queries, keys, values, selected.long())
     first, last = (int(row) for row in selected.aminmax())
     if first < 0 or last >= n_rows:
         raise ValueError(

@@ -94,8 +94,8 @@ def expected_actions(prediction: th.Tensor, layout: ActionLayout, action_loss: s
         if action_loss == "cross_entropy":
             result[:, columns] = part.softmax(dim=-1)
         else:
-            # 1e-30 is lost in rounding beside any other value, so it only matters where all values are zero
-            positive = part.clamp(min=0) + 1e-30
+            # Not zero, so that the sum is positive where no value is. Beside any other value this is nothing
+            positive = part.clamp(min=1e-30)
             result[:, columns] = positive / positive.sum(dim=-1, keepdim=True)
     if layout.binary_columns:
         binary = prediction[:, layout.binary_columns]

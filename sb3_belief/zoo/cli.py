@@ -1,4 +1,4 @@
-"""Command line: ``sb3-belief train | enjoy | envs | demo``."""
+"""Command line: ``sb3-belief train | enjoy | export | envs | demo``."""
 
 import argparse
 import os
@@ -19,9 +19,10 @@ def make_parser() -> argparse.ArgumentParser:
     :return: The parser
     """
     parser = argparse.ArgumentParser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
-    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | envs | demo")
+    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | export | envs | demo")
     _add_train(commands.add_parser("train", help="train a team from a YAML configuration", **_STYLE))
     _add_enjoy(commands.add_parser("enjoy", help="replay a trained team", **_STYLE))
+    _add_export(commands.add_parser("export", help="write an agent to a file that runs without this package", **_STYLE))
     _add_envs(commands.add_parser("envs", help="list the environments, or check one", **_STYLE))
     _add_demo(commands.add_parser("demo", help="train, measure and show a team on Traffic Junction", **_STYLE))
     return parser
@@ -131,6 +132,14 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
 
 
+def _add_export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "agent", metavar="TEAM:agent", help="folder of a run or zip of a team, and the agent; or the zip of a single agent"
+    )
+    parser.add_argument("--format", choices=["onnx", "torch"], default="onnx", help="format of the file")
+    parser.add_argument("--output", help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder")
+
+
 def _add_envs(parser: argparse.ArgumentParser) -> None:
     # "sb3-belief envs" without a further word lists all
     parser.set_defaults(suite=None)
@@ -162,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     args = make_parser().parse_args(argv)
-    action = {"train": _train, "enjoy": _enjoy, "envs": _envs, "demo": _demo}[args.subcommand]
+    action = {"train": _train, "enjoy": _enjoy, "export": _export, "envs": _envs, "demo": _demo}[args.subcommand]
     return _run(action, args, ["sb3-belief", *argv])
 
 
@@ -232,6 +241,13 @@ def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
             extra_packages=tuple(args.allow_package),
         )
     )
+    return 0
+
+
+def _export(args: argparse.Namespace, _: list[str]) -> int:
+    from sb3_belief.zoo.export import export
+
+    export(args.agent, args.format, args.output)
     return 0
 
 

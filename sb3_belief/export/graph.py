@@ -1,0 +1,164 @@
+"""What is exported of an agent: one pass from its observation to the probabilities of its actions, and to its belief."""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from sb3_belief.belief import BeliefOutput, HistoryContext, expected_actions
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, flatten_observation
+from sb3_belief.export.normalization import Normalization
+
+MASK = "action_mask"
+
+
+class PolicyGraph(nn.Module):
+    """
+    An agent's policy as a function of its observation and nothing else.
+
+    The history is encoded here, once, and the belief is its mean: nothing is drawn. So the probabilities are those of
+    ``policy.get_distribution``, whose mode ``predict(deterministic=True)`` takes, and the belief is that of
+    ``policy.predict_others``.
+
+    The inputs are ``observation``, or ``observation.<key>`` for each key of a Dict, batch first, in the policy's own space
+    (images with the channels first), and for a masked policy ``action_mask``, bool ``[B, k]``. The outputs are, by name:
+
+    - ``action_probabilities`` ``[B, k]``: the probability of each action (Discrete), of each value dimension after dimension
+      (MultiDiscrete), or of a one (MultiBinary);
+    - for Box actions, instead, ``action_mean`` and ``action_std`` ``[B, ...]``, to be clipped to the space's bounds;
+    - ``others.<name>`` ``[B, width of its action]`` for each of the others: its expected action, as in
+      ``policy.predict_others(...).actions``;
+    - ``belief_mean`` and, where the belief is a distribution, ``belief_std`` ``[B, z]``.
+
+    Where several rows of the history are equally similar to an observation, up to rounding, and not all of them are selected,
+    the file may select others of them than PyTorch does. So it is where observations repeat exactly.
+
+    :param model: The agent's model, on the CPU
+    :param statistics: Its normalisation, if it has one. The graph then takes observations before they are normalised
+    :raises ValueError: If its policy cannot be exported; the message says which can
+    """
+
+    #: An actor-critic policy of SB3 or sb3-contrib, with or without a belief
+    policy: Any
+
+    def __init__(self, model: BaseAlgorithm, statistics: VecNormalize | None = None) -> None:
+        super().__init__()
+        reason = _why_not(model.policy)
+        if reason:
+            raise ValueError(
+                f"{type(model).__name__} cannot be exported: its {type(model.policy).__name__} {reason}. What can be exported "
+                "are actor-critic policies without a recurrent state, as of BeliefPPO, MaskableBeliefPPO, PPO and A2C."
+            )
+        policy = model.policy
+        policy.set_training_mode(False)
+        self.policy = policy
+        self.masked = isinstance(policy, MaskableActorCriticPolicy)
+        space = policy.observation_space
+        self.observation_names = [f"observation.{key}" for key in space] if isinstance(space, spaces.Dict) else ["observation"]
+        self.normalization = None
+        if statistics is not None and statistics.norm_obs:
+            self.normalization = Normalization(statistics)
+        extractor = getattr(policy, "features_extractor", None)
+        self._extractor = extractor if isinstance(extractor, BeliefExtractor) else None
+        self._context: HistoryContext | None = None
+        if self._extractor is not None and self._extractor.history is not None:
+            with th.no_grad():
+                self._context = self._extractor.belief.encode_history(self._extractor.history)
+
+    @property
+    def input_names(self) -> list[str]:
+        """Names of the inputs, in their order."""
+        return [*self.observation_names, *([MASK] if self.masked else [])]
+
+    def examples(self, n: int) -> tuple[th.Tensor, ...]:
+        """
+        Return inputs of the right types and shapes, sampled from the observation space. The masks allow everything.
+
+        :param n: Number of observations
+        :return: The inputs in the order of ``input_names``, ``n`` rows each
+        """
+        space, action_space = self.policy.observation_space, self.policy.action_space
+        parts = list(space.values()) if isinstance(space, spaces.Dict) else [space]
+        inputs = [th.stack([th.as_tensor(part.sample()) for _ in range(n)]) for part in parts]
+        if not self.masked:
+            return tuple(inputs)
+        # sb3-contrib masks a zero and a one of each component of MultiBinary
+        width = spaces.flatdim(action_space) * (2 if isinstance(action_space, spaces.MultiBinary) else 1)
+        return (*inputs, th.ones(n, width, dtype=th.bool))
+
+    @th.no_grad()
+    def outputs(self, *inputs: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Compute in PyTorch what the exported file computes.
+
+        :param inputs: In the order of ``input_names``
+        :return: The outputs by name, without gradients
+        """
+        return self(*inputs)
+
+    def forward(self, *inputs: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Run the policy.
+
+        :param inputs: In the order of ``input_names``
+        :return: The outputs by name
+        """
+        policy, space = self.policy, self.policy.observation_space
+        parts = inputs[: len(self.observation_names)]
+        observation = dict(zip(space, parts, strict=True)) if isinstance(space, spaces.Dict) else parts[0]
+        if self.normalization is not None:
+            observation = self.normalization(observation)
+        observation = preprocess_obs(observation, space, policy.normalize_images)
+        if self._extractor is None:
+            features, believed = policy.pi_features_extractor(observation), {}
+        else:
+            output = self._extractor.belief(flatten_observation(observation), context=self._context)
+            features = self._extractor.with_belief(self._extractor.features(observation), output)
+            believed = self._believed(output)
+        latent = policy.mlp_extractor.forward_actor(features)
+        return {**self._actions(latent, inputs[-1] if self.masked else None), **believed}
+
+    def _believed(self, output: BeliefOutput) -> dict[str, th.Tensor]:
+        outputs, policy = {}, self.policy
+        if output.prediction is not None:
+            expected = expected_actions(output.prediction, policy.layout, policy.options.action_loss)
+            for owner, name in enumerate(policy.others_action_spaces):
+                outputs[f"others.{name}"] = expected[:, policy.layout.columns_of(owner)]
+        outputs["belief_mean"] = output.mean
+        if policy.options.variant.samples:
+            outputs["belief_std"] = output.log_std.exp()
+        return outputs
+
+    def _actions(self, latent: th.Tensor, mask: th.Tensor | None) -> dict[str, th.Tensor]:
+        """Read the parameters off the distribution that the policy makes."""
+        made, space = self.policy._get_action_dist_from_latent(latent), self.policy.action_space
+        if mask is not None:
+            made.apply_masking(mask)
+        # sb3-contrib calls a list of distributions by another name than SB3
+        found = getattr(made, "distributions", None) or made.distribution
+        if isinstance(space, spaces.Box):
+            shape = (-1, *space.shape)
+            return {"action_mean": found.mean.reshape(shape), "action_std": found.stddev.reshape(shape)}
+        if isinstance(found, list):
+            # sb3-contrib has a categorical distribution for each component of MultiBinary
+            parts = [each.probs[:, 1:] if isinstance(space, spaces.MultiBinary) else each.probs for each in found]
+            return {"action_probabilities": th.cat(parts, dim=1)}
+        return {"action_probabilities": found.probs}
+
+
+def _why_not(policy: BasePolicy) -> str | None:
+    """Return why a policy cannot be exported, or None if it can."""
+    if isinstance(policy, RecurrentActorCriticPolicy):
+        return "has a recurrent state, which would have to be passed on between calls"
+    if not isinstance(policy, (ActorCriticPolicy, MaskableActorCriticPolicy)):
+        return "is not an actor-critic policy, so it gives no probabilities of actions"
+    if getattr(policy, "squash_output", False):
+        return "squashes its actions (squash_output=True), so mean and deviation do not describe them"
+    return None if policy.device.type == "cpu" else f"is on {policy.device}; load the model with device='cpu'"

@@ -1,0 +1,62 @@
+"""The command ``sb3-belief export``."""
+
+import zipfile
+
+import onnxruntime
+import pytest
+import torch as th
+
+from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.zoo.cli import main
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A folder with the team of a run, and the zip of one of its agents."""
+    folder = tmp_path_factory.mktemp("run")
+    env = make_team_env("traffic-junction-easy", n_envs=2, seed=0)
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=8, batch_size=16, normalize=True)
+    team.learn(16).save(folder / "team.zip")
+    with zipfile.ZipFile(folder / "team.zip") as archive:
+        archive.extract("agents/car_1.zip", folder)
+    return folder
+
+
+def test_an_agent_is_written_where_one_is(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", f"{run}:car_1"]) == 0
+    session = onnxruntime.InferenceSession("car_1.onnx")
+    printed = capsys.readouterr().out
+    assert "input   observation: float32 [B, 79]" in printed and "output  others.car_0: float32 [B, 2]" in printed
+    for each in (*session.get_inputs(), *session.get_outputs()):
+        assert f"{each.name}: " in printed
+    assert main(["export", f"{run / 'team.zip'}:car_1", "--format", "torch", "--output", "deep/down.pt2"]) == 0
+    # The agent's statistics went with it
+    env = make_team_env("traffic-junction-easy", n_envs=3, seed=1)
+    observations = env.reset()
+    probabilities = th.export.load("deep/down.pt2").module()(th.as_tensor(observations["car_1"]))["action_probabilities"]
+    actions, _ = Team.load(run / "team.zip").predict(observations, deterministic=True)
+    assert (probabilities.argmax(dim=1).numpy() == actions["car_1"]).all()
+    (onnx,) = session.run(["action_probabilities"], {"observation": observations["car_1"]})
+    assert abs(onnx - probabilities.detach().numpy()).max() < 1e-5
+
+
+def test_a_single_agents_zip_will_do(run, tmp_path):
+    assert main(["export", str(run / "agents" / "car_1.zip"), "--output", str(tmp_path / "a.onnx")]) == 0
+    assert (tmp_path / "a.onnx").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "message"),
+    [
+        ("{run}", [], "is a team of ['car_0', 'car_1', 'car_2', 'car_3', 'car_4'], without ''"),
+        ("{run}:car_9", [], "without 'car_9'"),
+        ("{run}/agents/car_1.zip:car_1", [], "is the zip of a single agent"),
+        ("nowhere:car_1", [], "no file or folder 'nowhere:car_1'"),
+        ("{run}:car_1", ["--output", "car.pt2"], "end it in .onnx"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(run, tmp_path, monkeypatch, capsys, given, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", given.format(run=run), *options]) == 2
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
