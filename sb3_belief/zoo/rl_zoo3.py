@@ -7,7 +7,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
+from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_value
@@ -50,8 +52,9 @@ def register_rl_zoo3() -> None:
 
     For these algorithms ``--conf-file`` (default: ``zoo_configs/<algo>.yml``) is read as by ``sb3-belief``: the settings of
     the section ``default`` hold for all environments, ``3e-4`` is a number, and dotted paths and ``lin_x`` are possible
-    wherever the algorithm takes a class or a schedule. Everything else is as rl_zoo3 does it. Its ``env_wrapper`` wraps the
-    learner's environment. It evaluates without action masks, so use ``--eval-freq -1`` if the environment refuses actions.
+    wherever the algorithm takes a class or a schedule. ``maskable_belief_ppo`` is evaluated with the environment's masks, in
+    training and in a search. Everything else is as rl_zoo3 does it: its ``env_wrapper`` wraps the learner's environment, and
+    its ``enjoy`` acts without masks.
 
     :raises ModuleNotFoundError: If rl_zoo3 is not installed. The message has the line that installs it
     """
@@ -63,7 +66,8 @@ def register_rl_zoo3() -> None:
         if (error.name or "").partition(".")[0] != "rl_zoo3":
             raise
         raise ModuleNotFoundError(
-            "register_rl_zoo3() needs RL Baselines3 Zoo, which is not installed: pip install rl_zoo3", name="rl_zoo3"
+            "register_rl_zoo3() needs RL Baselines3 Zoo, which is not installed: pip install 'sb3-belief[rl-zoo3]'",
+            name="rl_zoo3",
         ) from error
     utils.ALGOS.update(ALGOS)
     sample, convert = _with_belief(search.sample_ppo_params, search.convert_onpolicy_params)
@@ -72,7 +76,7 @@ def register_rl_zoo3() -> None:
         search.HYPERPARAMS_SAMPLER[algo], search.HYPERPARAMS_CONVERTER[algo] = searched
     # rl_zoo3.train has imported the class by name, so it is replaced there. mypy knows no attributes of such a module, hence
     # vars()
-    vars(train)["ExperimentManager"] = _reading_our_files(exp_manager.ExperimentManager)
+    vars(train)["ExperimentManager"] = _reading_our_files(exp_manager)
 
 
 def _with_belief(sample_ppo: Callable[..., Any], convert_ppo: Callable[..., Any]) -> tuple[Callable, Callable]:
@@ -103,15 +107,21 @@ def _with_belief(sample_ppo: Callable[..., Any], convert_ppo: Callable[..., Any]
     return sample, convert
 
 
-def _reading_our_files(manager_class: Any) -> Any:
+def _reading_our_files(exp_manager: Any) -> Any:
     """
-    Return a subclass of rl_zoo3's ``ExperimentManager`` that reads our YAML files for our algorithms.
+    Return a subclass of rl_zoo3's ``ExperimentManager`` that reads our YAML files for our algorithms and evaluates with masks.
 
     It is made by a function because rl_zoo3 is an optional package.
 
-    :param manager_class: rl_zoo3's ``ExperimentManager``
+    :param exp_manager: rl_zoo3's module ``exp_manager``
     :return: The subclass
     """
+    manager_class: Any = exp_manager.ExperimentManager
+    # Not exp_manager's, which may have been replaced below
+    trial_callback: Any = importlib.import_module("rl_zoo3.callbacks").TrialEvalCallback
+
+    class MaskableTrialEvalCallback(trial_callback, MaskableEvalCallback):
+        """rl_zoo3's ``TrialEvalCallback``, evaluating with masks."""
 
     class ExperimentManager(manager_class):
         """``ExperimentManager`` of rl_zoo3 that reads our YAML files for our algorithms."""
@@ -121,6 +131,12 @@ def _reading_our_files(manager_class: Any) -> Any:
         def __init__(self, args: Any, algo: str, *others: Any, config: str | None = None, **kwargs: Any) -> None:
             if algo in ALGOS and config is None:
                 config = str(find_config_file(algo))
+            # rl_zoo3 makes them by these names, which are global there
+            masked = algo == "maskable_belief_ppo"
+            vars(exp_manager).update(
+                EvalCallback=MaskableEvalCallback if masked else EvalCallback,
+                TrialEvalCallback=MaskableTrialEvalCallback if masked else trial_callback,
+            )
             super().__init__(args, algo, *others, config=config, **kwargs)
 
         def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:

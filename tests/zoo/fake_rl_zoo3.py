@@ -10,7 +10,12 @@ from typing import Any
 
 import yaml
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+
+
+class TrialEvalCallback(EvalCallback):
+    """As rl_zoo3's, less what concerns a trial."""
 
 
 class ExperimentManager:
@@ -78,7 +83,13 @@ def modules() -> dict[str, ModuleType]:
     contents: dict[str, dict[str, Any]] = {
         "rl_zoo3": {"ALGOS": algos, "__path__": []},
         "rl_zoo3.utils": {"ALGOS": algos},
-        "rl_zoo3.exp_manager": {"ALGOS": algos, "ExperimentManager": ExperimentManager},
+        "rl_zoo3.exp_manager": {
+            "ALGOS": algos,
+            "ExperimentManager": ExperimentManager,
+            "EvalCallback": EvalCallback,
+            "TrialEvalCallback": TrialEvalCallback,
+        },
+        "rl_zoo3.callbacks": {"TrialEvalCallback": TrialEvalCallback},
         "rl_zoo3.train": {"ALGOS": algos, "ExperimentManager": ExperimentManager},
         "rl_zoo3.hyperparams_opt": {
             "convert_onpolicy_params": convert_onpolicy_params,

@@ -2,15 +2,19 @@
 
 import argparse
 import importlib.util
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.zoo import register_rl_zoo3
@@ -113,6 +117,15 @@ def test_objects_from_the_command_line_stay_what_they_are(zoo):
     assert model.policy.activation_fn is th.nn.ELU and model.kl_coef(1.0) == 0.01
 
 
+def test_masks_hold_in_evaluations_of_the_masked_algorithm_alone(zoo):
+    made = zoo["rl_zoo3.exp_manager"]
+    manager(zoo, "maskable_belief_ppo")
+    assert made.EvalCallback is MaskableEvalCallback
+    assert made.TrialEvalCallback.__mro__[1:3] == (fake_rl_zoo3.TrialEvalCallback, MaskableEvalCallback)
+    manager(zoo, "belief_ppo")
+    assert made.EvalCallback is EvalCallback and made.TrialEvalCallback is fake_rl_zoo3.TrialEvalCallback
+
+
 def test_mistakes_are_named(zoo, tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(yaml.safe_dump({"default": {**SMALL, "n_timesteps": 8, "history_length": "long"}}))
@@ -130,7 +143,7 @@ def test_the_zoos_own_algorithms_are_left_alone(zoo, tmp_path):
 
 def test_without_it_there_is_a_line_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
-    with pytest.raises(ModuleNotFoundError, match="pip install rl_zoo3"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sb3-belief\[rl-zoo3\]'"):
         register_rl_zoo3()
 
 
@@ -151,20 +164,55 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("rl_zoo3") is None, reason="rl_zoo3 is not installed (pip install rl_zoo3 pandas)"
-)
-@pytest.mark.parametrize("algo", ["belief_ppo", "ippo", "maskable_belief_ppo"])
-@pytest.mark.parametrize("flags", ["--eval-freq 128 --eval-episodes 1", "-optimize --n-trials 1 --n-evaluations 1"])
-def test_the_real_one_trains_and_searches(tmp_path, algo, flags):
-    (tmp_path / "train_zoo.py").write_text(SCRIPT)
-    command = f"train_zoo.py --algo {algo} --env Car-v0 -n 256 --seed 0 --device cpu --no-optim-plots {flags} -params n_envs:2"
-    result = subprocess.run([sys.executable, *command.split()], cwd=tmp_path, capture_output=True, text=True)
+REAL = pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reason="rl_zoo3 is not installed (make test-rl-zoo3)")
+EVALUATE = "--eval-freq 128 --eval-episodes 1"
+SEARCH = "-optimize --n-trials 1 --n-evaluations 1"
+
+
+def run_real(folder, script, command):
+    (folder / "train_zoo.py").write_text(script)
+    words = [sys.executable, "train_zoo.py", *command.split(), *"-n 256 --seed 0 --device cpu --no-optim-plots".split()]
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    result = subprocess.run([*words, "-params", "n_envs:2"], cwd=folder, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    if flags.startswith("-optimize"):
-        assert "Number of finished trials:  1" in result.stdout and "Best trial" in result.stdout
+    return result.stdout
+
+
+@REAL
+@pytest.mark.parametrize("algo", ["belief_ppo", "ippo", "maskable_belief_ppo"])
+@pytest.mark.parametrize("flags", [EVALUATE, SEARCH])
+def test_the_real_one_trains_and_searches(tmp_path, algo, flags):
+    printed = run_real(tmp_path, SCRIPT, f"--algo {algo} --env Car-v0 {flags}")
+    if flags == SEARCH:
+        assert "Number of finished trials:  1" in printed and "Best trial" in printed
         return
     folder = tmp_path / "logs" / algo / "Car-v0_1"
     model = ALGOS[algo].load(folder / "Car-v0.zip")
     assert model.num_timesteps >= 256
     assert (folder / "best_model.zip").exists() and (folder / "Car-v0" / "config.yml").exists()
+
+
+MASKED_SCRIPT = """
+import gymnasium as gym
+from rl_zoo3.train import train
+from sb3_belief.zoo import register_rl_zoo3
+
+def stay(obs):
+    return 0
+
+# Refuses every action but one at each step, in evaluations too
+gym.register("Masked-v0", "sb3_belief:AgentEnv", kwargs={
+    "parallel_env": "tests.team.toy_envs:MaskedEnv", "agent": "agent_0", "partners": {"agent_1": stay}})
+register_rl_zoo3()
+if __name__ == "__main__":
+    train()
+"""
+
+
+@REAL
+def test_the_real_one_evaluates_with_masks(tmp_path):
+    run_real(tmp_path, MASKED_SCRIPT, f"--algo maskable_belief_ppo --env Masked-v0 {EVALUATE}")
+    folder = tmp_path / "logs" / "maskable_belief_ppo" / "Masked-v0_1"
+    assert (folder / "best_model.zip").exists() and (folder / "evaluations.npz").exists()
+    printed = run_real(tmp_path, MASKED_SCRIPT, f"--algo maskable_belief_ppo --env Masked-v0 {SEARCH}")
+    assert "Number of finished trials:  1" in printed and "Value: None" not in printed and "Best trial" in printed
