@@ -37,8 +37,8 @@ def main(total_timesteps: int = 30_000) -> dict[str, float]:
     for leader in map(np.array, itertools.permutations(CUES)):
         before.append(follower.predict(CUES, deterministic=True)[0] == leader)
         watched = np.random.default_rng(0).integers(3, size=400)
-        # Observations, and the leader's actions as in info["others_actions"]: one-hot
-        follower.policy.remember(watched, np.eye(3, dtype=np.float32)[leader[watched]])
+        # The follower's own observations, and what the leader did at them
+        follower.policy.remember(watched, {"leader": leader[watched]})
         after.append(follower.predict(CUES, deterministic=True)[0] == leader)
         believed = follower.policy.predict_others(CUES).actions["leader"].argmax(axis=1)
         print(f"A leader plays {leader} at the cues 0 1 2. After 400 steps of watching the follower expects {believed}.")

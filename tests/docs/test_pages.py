@@ -53,6 +53,12 @@ def test_every_page_stands_in_a_list_of_contents():
     assert listed == {path.resolve() for path in PAGES} - {DOCS / "index.md"}
 
 
+def test_the_readme_stands_alone():
+    """A package index shows it beside no other file, and without anchors of its headings."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"\]\((?!https://)[^)]*\)", text) == [] and "<img" not in text
+
+
 def test_the_readme_stays_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 160
 
