@@ -6,6 +6,10 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
+RL_ZOO3_VENV := .venv-rl-zoo3
+RL_ZOO3_STAMP := $(RL_ZOO3_VENV)/.installed
+PACKAGE_VENV := .venv-package
+PACKAGE_STAMP := $(VENV)/.installed-package
 PEERS_VENV := .venv-peers
 PEERS_STAMPS := $(patsubst %,$(PEERS_VENV)/%/.installed,rllib agilerl benchmarl)
 SOURCES := sb3_belief tests benchmarks studies examples docs/conf.py train.py
@@ -16,11 +20,11 @@ PYTEST_JOBS ?= auto
 CONFORMANCE_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help install demo test test-slow test-envs test-smax pytest conformance bench bench-peers docs lint type format \
-	check-codestyle commit-checks clean
+.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 pytest conformance bench bench-peers docs package \
+	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
+	@grep -E '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## /\1\t/' | expand -t 18
 
 install: $(STAMP)  ## make the virtual environment
 
@@ -76,12 +80,33 @@ test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from i
 test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
 	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/adapters/smax $(PYTEST_ARGS)
 
+# rl_zoo3 has an environment of its own, as a user's would be: without what our tests and plots need beside it
+$(RL_ZOO3_STAMP): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(RL_ZOO3_VENV)
+	$(RL_ZOO3_VENV)/bin/python -m pip install --quiet -c constraints.txt torch
+	$(RL_ZOO3_VENV)/bin/python -m pip install --quiet -c constraints.txt -e '.[rl-zoo3]' pytest
+	@touch $@
+
+test-rl-zoo3: $(RL_ZOO3_STAMP)  ## train and search with the real rl_zoo3, in an environment of its own
+	$(RL_ZOO3_VENV)/bin/python -m pytest tests/zoo/test_rl_zoo3.py $(PYTEST_ARGS)
+
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
 
 docs: $(DOCS_STAMP)  ## build the pages into docs/_build/html; any warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
+$(PACKAGE_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[package]'
+	@touch $@
+
+package: $(PACKAGE_STAMP)  ## build the distributions into dist/ and check them, the wheel in an environment of its own
+	rm -rf dist $(PACKAGE_VENV)
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	$(PYTHON) -m venv $(PACKAGE_VENV)
+	$(BIN)/python -m tests.package.check dist $(PACKAGE_VENV)
 
 lint: $(STAMP)  ## look for mistakes
 	$(BIN)/ruff check $(SOURCES)
@@ -100,5 +125,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) $(SMAX_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) $(RL_ZOO3_VENV) $(PACKAGE_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
