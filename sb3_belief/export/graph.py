@@ -71,6 +71,7 @@ class PolicyGraph(nn.Module):
         if self._extractor is not None and self._extractor.history is not None:
             with th.no_grad():
                 self._context = self._extractor.belief.encode_history(self._extractor.history)
+        self._check_policy(type(model).__name__)
 
     @property
     def input_names(self) -> list[str]:
@@ -110,20 +111,26 @@ class PolicyGraph(nn.Module):
         :param inputs: In the order of ``input_names``
         :return: The outputs by name
         """
-        policy, space = self.policy, self.policy.observation_space
-        parts = inputs[: len(self.observation_names)]
-        observation = dict(zip(space, parts, strict=True)) if isinstance(space, spaces.Dict) else parts[0]
-        if self.normalization is not None:
-            observation = self.normalization(observation)
-        observation = preprocess_obs(observation, space, policy.normalize_images)
+        policy, (observation, mask) = self.policy, self._arguments(inputs)
+        observation = preprocess_obs(observation, policy.observation_space, policy.normalize_images)
         if self._extractor is None:
             features, believed = policy.pi_features_extractor(observation), {}
         else:
             output = self._extractor.belief(flatten_observation(observation), context=self._context)
             features = self._extractor.with_belief(self._extractor.features(observation), output)
             believed = self._believed(output)
-        latent = policy.mlp_extractor.forward_actor(features)
-        return {**self._actions(latent, inputs[-1] if self.masked else None), **believed}
+        distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(features))
+        if mask is not None:
+            distribution.apply_masking(mask)
+        return {**self._action_outputs(distribution), **believed}
+
+    def _arguments(self, inputs: tuple[th.Tensor, ...]) -> tuple[Any, th.Tensor | None]:
+        """Return the observation, normalised and a dict where its space is one, and the mask."""
+        space, parts = self.policy.observation_space, inputs[: len(self.observation_names)]
+        observation: Any = dict(zip(space, parts, strict=True)) if isinstance(space, spaces.Dict) else parts[0]
+        if self.normalization is not None:
+            observation = self.normalization(observation)
+        return observation, inputs[-1] if self.masked else None
 
     def _believed(self, output: BeliefOutput) -> dict[str, th.Tensor]:
         outputs, policy = {}, self.policy
@@ -136,11 +143,9 @@ class PolicyGraph(nn.Module):
             outputs["belief_std"] = output.log_std.exp()
         return outputs
 
-    def _actions(self, latent: th.Tensor, mask: th.Tensor | None) -> dict[str, th.Tensor]:
-        """Read the parameters off the distribution that the policy makes."""
-        made, space = self.policy._get_action_dist_from_latent(latent), self.policy.action_space
-        if mask is not None:
-            made.apply_masking(mask)
+    def _action_outputs(self, made: Any) -> dict[str, th.Tensor]:
+        """Read the parameters off the distribution that the policy has made."""
+        space = self.policy.action_space
         # sb3-contrib calls a list of distributions by another name than SB3
         found = getattr(made, "distributions", None) or made.distribution
         if isinstance(space, spaces.Box):
@@ -151,6 +156,20 @@ class PolicyGraph(nn.Module):
             parts = [each.probs[:, 1:] if isinstance(space, spaces.MultiBinary) else each.probs for each in found]
             return {"action_probabilities": th.cat(parts, dim=1)}
         return {"action_probabilities": found.probs}
+
+    def _check_policy(self, algorithm: str) -> None:
+        """Refuse a policy of the user's own that makes its distributions in another way than SB3's."""
+        inputs = self.examples(8)
+        observation, mask = self._arguments(inputs)
+        with th.no_grad():
+            outputs = self(*inputs)
+            made = self.policy.get_distribution(observation, *([] if mask is None else [mask]))
+            for name, expected in self._action_outputs(made).items():
+                if not th.allclose(outputs[name], expected, rtol=1e-3, atol=1e-5):
+                    raise ValueError(
+                        f"{algorithm} cannot be exported: the get_distribution() of its {type(self.policy).__name__} does "
+                        "something else than SB3's. Export it by torch.export, from a module of your own."
+                    )
 
 
 def _why_not(policy: BasePolicy) -> str | None:

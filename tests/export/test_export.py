@@ -10,9 +10,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.export import export_model
 from tests.belief_ppo.helpers import SMALL, make_model, observations_of
 from tests.belief_ppo.toy_envs import AmongOthers
@@ -208,6 +209,32 @@ def test_policies_of_sb3_are_exported_or_refused(tmp_path):
     with pytest.raises(ValueError, match=r"in the format 'torch'; end it in .pt2"):
         export_model(a2c, tmp_path / "b.onnx", "torch")
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+class Sharper(BeliefActorCriticPolicy):
+    """Acts on other probabilities than its networks give."""
+
+    def get_distribution(self, obs):
+        made = super().get_distribution(obs)
+        return made.proba_distribution(2 * made.distribution.logits)  # type: ignore[union-attr]
+
+
+class Extractor(FlattenExtractor):
+    """Features of the user's own."""
+
+    def forward(self, observations):
+        return super().forward(observations).tanh()
+
+
+def test_networks_of_ones_own_are_exported_and_passes_of_ones_own_are_refused(tmp_path):
+    model = make_model(policy_kwargs=dict(features_extractor_class=Extractor)).learn(84)
+    observations, inputs = inputs_of(model)
+    export_model(model, tmp_path / "a.onnx", "onnx")
+    assert_equal_outputs(run_onnx(tmp_path / "a.onnx", inputs), expected_outputs(model, observations))
+
+    own = BeliefPPO(Sharper, make_vec_env(AmongOthers), **SMALL)
+    with pytest.raises(ValueError, match=r"the get_distribution\(\) of its Sharper does something else"):
+        export_model(own, tmp_path / "b.onnx", "onnx")
 
 
 def test_without_onnx_there_is_a_line_that_installs_it(monkeypatch, tmp_path):
