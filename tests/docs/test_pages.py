@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from sb3_belief.zoo.cli import make_parser
+from sb3_belief.zoo.config import load_config
+from sb3_belief.zoo.names import get_env
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
@@ -75,3 +79,18 @@ def test_hosted_ci_runs_the_claimed_versions():
     claimed = re.findall(r"Programming Language :: Python :: (3\.\d+)$", (ROOT / "setup.cfg").read_text(), re.MULTILINE)
     assert claimed and set(re.findall(r'"(3\.\d+)"', (ROOT / ".github" / "workflows" / "ci.yml").read_text())) == set(claimed)
     assert "make docs" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_the_commands_for_the_papers_names_are_accepted():
+    text = (DOCS / "paper.md").read_text(encoding="utf-8")
+    commands = re.findall(r"`train\.py ([^`]+)`", text)
+    assert len(commands) >= 8
+    parser = make_parser()
+    for command in commands:
+        words = command.replace("ENV", "traffic-junction-medium").replace("belief:B", "belief:static").split()
+        args = parser.parse_args(["train", *words])
+        # StarCraft II is not installed, so its ids are looked up and no more
+        get_env(args.env, "--env")
+        assert load_config(args.algo, "traffic-junction-medium", params=args.params).algo == args.algo
+    for setting in re.findall(r"`(?:-params )?((?:belief|similarity|history_length|keep_ratio):[\w.]+)`", text):
+        load_config("belief_ppo", "traffic-junction-medium", params=[setting])
