@@ -24,7 +24,7 @@ def export(given: str, file_format: str, output: str | None = None) -> Path:
     team, agent = _split(given)
     path = find_team(team, "export")
     try:
-        if zipfile.is_zipfile(path) and agent is not None and "team.json" not in zipfile.ZipFile(path).namelist():
+        if agent is not None and _is_single_agent(path):
             raise ConfigError(
                 f"export: {str(path)!r} is the zip of a single agent, so it has no {agent!r}. Leave out ':{agent}'."
             )
@@ -51,6 +51,13 @@ def _split(given: str) -> tuple[str, str | None]:
     if not colon or Path(given).exists() or not agent or not Path(team).exists():
         return given, None
     return team, agent
+
+
+def _is_single_agent(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "team.json" not in archive.namelist()
 
 
 def _shown(tensor: th.Tensor) -> str:

@@ -40,7 +40,7 @@ def service(tmp_path):
 
     def ask(path, **body):
         request = urllib.request.Request(f"http://127.0.0.1:{port}/{path}", json.dumps(body).encode())
-        for _ in range(200):
+        for _ in range(900):
             try:
                 with urllib.request.urlopen(request) as response:
                     return json.load(response)
