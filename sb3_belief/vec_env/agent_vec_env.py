@@ -32,6 +32,7 @@ class AgentTransition(NamedTuple):
     :param others_visible: Whose action of this step it could observe, bool ``[num_envs, n_others]``
     :param active: Whether it was in play when it acted, bool ``[num_envs]``
     :param ends: For each copy in which it is done: what SB3 expects in the info besides
+    :param own_infos: For each copy what the environment's own info of the agent holds besides; None if nowhere anything
     """
 
     obs: np.ndarray
@@ -41,6 +42,7 @@ class AgentTransition(NamedTuple):
     others_visible: np.ndarray
     active: np.ndarray
     ends: dict[int, dict[str, Any]]
+    own_infos: list[dict[str, Any]] | None = None
 
     def as_step(self) -> AgentStep:
         """
@@ -52,6 +54,10 @@ class AgentTransition(NamedTuple):
             {"others_actions": others, "others_visible": seen, "active": is_active}
             for others, seen, is_active in zip(self.others_actions, self.others_visible, self.active.tolist(), strict=True)
         ]
+        if self.own_infos is not None:
+            # Its keys are none of those above or below (own_infos.RESERVED)
+            for info, own in zip(infos, self.own_infos, strict=True):
+                info.update(own)
         for env_idx, end in self.ends.items():
             infos[env_idx].update(end)
         # Copies: SB3's on-policy algorithms add the bootstrapped value to the rewards in place
@@ -99,7 +105,8 @@ class AgentVecEnv(VecEnv):
     ``infos[e]`` holds ``others_actions`` float32 ``[W]`` (the others in order, the scripted ones last: one-hot for Discrete
     and MultiDiscrete, values for Box and MultiBinary; zero where not visible), ``others_visible`` bool ``[n_others]`` and
     ``active`` bool. At a done it also holds ``terminal_observation`` and ``TimeLimit.truncated``, and at the end of the team's
-    episode ``episode`` (with the agent's own return) and ``is_success``. ``get_attr("others_action_spaces")`` returns the
+    episode ``episode`` (with the agent's own return) and ``is_success``. What the environment's own info of the agent holds
+    besides (``infos[agent]["fuel"]``) is there under the same keys. ``get_attr("others_action_spaces")`` returns the
     spaces of the others, and ``env_method("action_masks")`` the agent's own masks where the environment has masks.
 
     :param source: Steps the team
@@ -269,6 +276,8 @@ class TransitionSplitter:
         cut = truncated & ~life_end & active
         seen_actions = self._seen_actions(actions, visible, infos)
         any_done = bool(dones.any())
+        by_agent = [info["agent_infos"] if "agent_infos" in info else {} for info in infos]
+        any_own = any(by_agent)
 
         transitions: list[AgentTransition] = []
         for i, agent in enumerate(self._agents):
@@ -277,8 +286,9 @@ class TransitionSplitter:
                 for env_idx in (np.flatnonzero(dones[:, i]) if any_done else ())
             }
             others = seen_actions[:, self._others[i]]
+            own = [each.get(agent, {}) for each in by_agent] if any_own else None
             transitions.append(
-                AgentTransition(obs[agent], rewards[:, i], dones[:, i], others, visible[:, i], active[:, i], ends)
+                AgentTransition(obs[agent], rewards[:, i], dones[:, i], others, visible[:, i], active[:, i], ends, own)
             )
         return transitions
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from math import isfinite
 from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium as gym
@@ -9,25 +10,29 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.common.exceptions import add_note
+from sb3_belief.vec_env.events import Flags, find_events, no_flags
+from sb3_belief.vec_env.own_infos import own_infos
+from sb3_belief.vec_env.returned import (
+    StepParts,
+    plain_flags,
+    plain_infos,
+    plain_reset,
+    plain_rewards,
+    plain_step,
+    plain_team_reward,
+)
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
-from sb3_belief.vec_env.validation import check_names, check_observation, check_wrappers, place
+from sb3_belief.vec_env.success import reports_success
+from sb3_belief.vec_env.user_env import UserEnv, separate_agents
+from sb3_belief.vec_env.validation import check_names, check_observation, no_last_observation, place
+from sb3_belief.vec_env.visible import VisibleOthers
 
 # Says whose action of the last step each agent could observe: bool [n_others] by agent
 Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
-
-
-class Flags(NamedTuple):
-    """
-    What a joint step meant for each agent.
-
-    :param active: Whether it was in play when it acted, bool ``[n]``
-    :param life_end: Whether its own return ended (it terminated, or its life ended), bool ``[n]``
-    :param truncated: Whether its own return was cut off by a limit, bool ``[n]``; never together with ``life_end``
-    """
-
-    active: np.ndarray
-    life_end: np.ndarray
-    truncated: np.ndarray
+# Types of the infos of a step, and of the sum of its rewards if these are numbers
+_DICT = {dict}
+_NUMBERS = {float, int, np.float64, np.float32, np.int64, np.int32}
 
 
 class StepRecord(NamedTuple):
@@ -49,22 +54,6 @@ class StepRecord(NamedTuple):
     scripted_actions: np.ndarray | None
 
 
-class _Events(NamedTuple):
-    """
-    What happened to the agents in a joint step.
-
-    :param flags: What the step meant for each agent
-    :param ended: Whether all agents that were in play have terminated or been truncated
-    :param left: Agents that left in this step
-    :param successes: The ``is_success`` of the agents that reported one
-    """
-
-    flags: Flags
-    ended: bool
-    left: list[str]
-    successes: list[bool]
-
-
 class JointEnv(gym.Env):
     """
     Gymnasium environment of a whole team: observations and actions are dictionaries by agent, the reward is the team's.
@@ -84,16 +73,12 @@ class JointEnv(gym.Env):
     """
 
     def __init__(self, env: ParallelEnv, visibility: Visibility | None = None, copy: int = 0):
-        if not isinstance(env, ParallelEnv):
-            raise TypeError(
-                f"A team needs a pettingzoo.ParallelEnv, got {type(env).__name__}. An AEC environment is converted by"
-                " sb3_belief.envs.to_parallel(); a Gymnasium environment has no team."
-            )
-        check_wrappers(env)
+        user_env = UserEnv(env)
         self.env = env
-        self.possible_agents: list[str] = list(env.possible_agents)
-        self.observation_spaces = {agent: env.observation_space(agent) for agent in self.possible_agents}
-        self.action_spaces = {agent: env.action_space(agent) for agent in self.possible_agents}
+        # What is stepped: mostly the environment itself
+        self._game: Any = user_env if user_env.adapts else env
+        self.possible_agents: list[str] = user_env.possible_agents
+        self.observation_spaces, self.action_spaces = user_env.observation_spaces, user_env.action_spaces
         self.observation_space = spaces.Dict(self.observation_spaces)
         self.action_space = spaces.Dict(self.action_spaces)
         self.render_mode = getattr(env, "render_mode", None)
@@ -102,27 +87,26 @@ class JointEnv(gym.Env):
         self._scripted = ScriptedOthers(env)
         self.scripted_action_spaces = self._scripted.action_spaces
 
-        agents, n_scripted = range(len(self.possible_agents)), len(self.scripted_action_spaces)
-        # Row i lists the others of agent i: the other agents in order, then the scripted others
-        everyone = range(len(agents) + n_scripted)
-        self._others = np.array([[j for j in everyone if j != i] for i in agents], dtype=int).reshape(len(agents), -1)
-        self._scripted_in_play = np.ones(n_scripted, dtype=bool)
         self._mask_widths = {agent: mask_width(self.action_spaces[agent]) for agent in self.possible_agents}
         # The records of all uneventful steps share these arrays, so they are read-only
-        self._uneventful = _Events(_no_flags(len(agents)), ended=False, left=[], successes=[])
-        self._uneventful.flags.active[:] = True
-        self._all_visible = np.ones(self._others.shape, dtype=bool)
-        for shared in (*self._uneventful.flags, self._all_visible):
+        self._no_event = no_flags(len(self.possible_agents))
+        self._no_event.active[:] = True
+        for shared in self._no_event:
             shared.flags.writeable = False
-        self._visibility = optional_member(env, "visibility")
+        says = optional_member(env, "visibility")
         if visibility is not None:
-            if self._visibility is not None:
+            if says is not None:
                 raise ValueError(
-                    f"{type(env.unwrapped).__name__} says by its own visibility() who can observe whom, so it does not take"
-                    " the argument visibility: leave it out, or override the method in a wrapper."
+                    f"{type(user_env.unwrapped).__name__} says by its own visibility() who can observe whom, so it does not"
+                    " take the argument visibility: leave it out, or override the method in a wrapper."
                 )
-            self._visibility = partial(visibility, env)
-        self._team_reward = optional_member(env, "team_reward")
+            says = partial(visibility, env)
+        self._team_reward: Any = optional_member(env, "team_reward")
+        if user_env.renames:
+            says, self._team_reward = user_env.renamed_members(says, self._team_reward)
+        #: Whether the environment reports ``is_success``, as far as can be known before it does
+        self.reports_success = reports_success(env)
+        self._others = VisibleOthers(self.possible_agents, list(self.scripted_action_spaces), says)
         self._zero_obs = {
             agent: np.zeros(space.shape or (), dtype=space.dtype) for agent, space in self.observation_spaces.items()
         }
@@ -142,12 +126,22 @@ class JointEnv(gym.Env):
         :return: Observations by agent, and an info with ``action_masks`` as in ``StepRecord``, empty without masks
         :raises ValueError: If what the environment returns does not fit its agents and spaces
         """
-        obs, infos = self.env.reset(seed=seed, options=options)
         self._t = 0
-        if obs.keys() != self._names or self.env.agents != self.possible_agents:
-            check_names(self.possible_agents, self.env.agents, self.env.agents, {"observations": obs}, place(self._copy, 0))
+        try:
+            result = self._game.reset(seed=seed, options=options)
+        except Exception as error:
+            add_note(error, f"Raised by the environment's reset() {self._where}.")
+            raise
+        obs, infos = plain_reset(result, self._where)
+        separate_agents(self.env)
+        after = [] if self._game.agents is None else list(self._game.agents)
+        if not after:
+            raise ValueError(f"agents is empty {self._where}: reset() must fill it with the agents that are in play.")
+        self._check_possible_agents()
+        if obs.keys() != self._names or after != self.possible_agents:
+            check_names(self.possible_agents, after, after, {"observations": obs}, self._where)
         self._check_observations(obs, self.possible_agents)
-        return self._observations(obs), self._masks(infos)
+        return self._observations(obs), self._masks(plain_infos(infos, self.possible_agents, self._where))
 
     def step(self, action: dict[str, Any]) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """
@@ -158,37 +152,46 @@ class JointEnv(gym.Env):
             was truncated, and an info with the ``StepRecord`` under ``joint``
         :raises ValueError: If what the environment returns does not fit its agents and spaces
         """
-        before = self.env.agents[:]
+        before = list(self._game.agents)
         self._t += 1
-        obs, rewards, terminations, truncations, infos = self.env.step({agent: action[agent] for agent in before})
-        after = self.env.agents
+        obs, rewards, terminations, truncations, infos = self._step_game({agent: action[agent] for agent in before})
+        after = list(self._game.agents)
         agents = self.possible_agents
-        # Here and below, a cheap comparison decides whether the check that finds the cause has to run
+        # Here and below, a cheap comparison decides whether something has to be converted, or the cause of a fault found
         if obs.keys() != self._names or rewards.keys() != self._names or after != agents:
-            check_names(agents, before, after, {"observations": obs, "rewards": rewards}, place(self._copy, self._t))
+            check_names(agents, before, after, {"observations": obs, "rewards": rewards}, self._where)
         for agent, shape in self._shapes:
             if agent in obs and getattr(obs[agent], "shape", None) != shape:
                 self._check_observations(obs, [agent])
-        any_info = any(infos.values())
+        agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
+        try:
+            total = sum(agent_rewards)
+            any_info = any(infos.values())
+            any_end = True in terminations.values() or True in truncations.values()
+        except (TypeError, ValueError):
+            # One of them is no number, or an array of several
+            total, any_info, any_end = None, True, True
+            terminations = plain_flags("terminations", terminations, agents, self._where)
+            truncations = plain_flags("truncations", truncations, agents, self._where)
+        if type(total) not in _NUMBERS:
+            rewards = plain_rewards(rewards, self._where)
+            agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
+            total = sum(agent_rewards)
+        team_reward = float(total / len(agents)) if self._team_reward is None else self._own_team_reward(rewards, total)
         # In nearly all steps of nearly all environments nothing happens to any agent, and the loop over agents is saved
-        events = self._uneventful
-        if len(after) < len(agents) or any_info or True in terminations.values() or True in truncations.values():
-            events = self._events(before, after, terminations, truncations, infos)
+        if not (any_info or any_end or len(after) < len(agents)):
+            record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
+            return obs, team_reward, False, False, {"joint": record}
+        if any_info and set(map(type, infos.values())) != _DICT:
+            infos = plain_infos(infos, agents, self._where)
+        events = find_events(agents, before, after, terminations, truncations, infos)
         flags, left = events.flags, events.left
         done = events.ended or not after
 
-        agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
-        team_reward = sum(agent_rewards) / len(agents) if self._team_reward is None else self._team_reward(rewards)
-        uneventful = events is self._uneventful
-        visible = self._all_visible if uneventful and self._visibility is None else self._visible(flags.active)
-        masks = self._masks(infos).get("action_masks") if any_info or self._has_masks else None
-        scripted_actions = self._scripted.actions() if self.scripted_action_spaces else None
-        info: dict[str, Any] = {"joint": StepRecord(agent_rewards, flags, visible, masks, scripted_actions)}
-        if uneventful:
-            return obs, float(team_reward), False, False, info
+        info: dict[str, Any] = own_infos(infos, self.action_spaces) if any_info else {}
+        info["joint"] = self._record(agent_rewards, flags, infos if any_info or self._has_masks else None)
         if done or left:
-            # The value at a time limit is computed from these, so they are checked in full
-            self._check_observations(obs, agents if done else left)
+            self._check_ends(obs, flags, agents if done else left)
         observations = self._observations(obs)
         if done:
             if events.successes:
@@ -198,44 +201,60 @@ class JointEnv(gym.Env):
             info["terminal_observation"] = {agent: np.array(observations[agent]) for agent in left}
             observations.update({agent: self._zero_obs[agent] for agent in left})
         cut = done and bool(flags.truncated.any())
-        return observations, float(team_reward), done and not cut, cut, info
+        return observations, team_reward, done and not cut, cut, info
 
-    def _events(
-        self,
-        before: list[str],
-        after: list[str],
-        terminations: dict[str, bool],
-        truncations: dict[str, bool],
-        infos: dict[str, dict[str, Any]],
-    ) -> _Events:
-        """Find out what happened to the agents, of which ``before`` acted and ``after`` are still in play."""
-        left, successes = [], []
-        active, life_end, truncated = flags = _no_flags(len(self.possible_agents))
-        ended = True
-        for i, agent in enumerate(self.possible_agents):
-            if agent not in before:
-                continue
-            agent_info = infos.get(agent, {})
-            terminates, truncates = terminations.get(agent, False), truncations.get(agent, False)
-            has_left = agent not in after
-            # An agent that leaves for no stated reason has ended its life: there is nothing to bootstrap from
-            life_end[i] = terminates or agent_info.get("life_end", False) or (has_left and not truncates)
-            active[i] = agent_info.get("active", True)
-            truncated[i] = truncates and not life_end[i]
-            if has_left:
-                left.append(agent)
-            ended = ended and (terminates or truncates)
-            if "is_success" in agent_info:
-                successes.append(bool(agent_info["is_success"]))
-        return _Events(flags, ended, left, successes)
+    def _step_game(self, actions: dict[str, Any]) -> StepParts:
+        """Step the environment, and return what it returns as five dicts."""
+        try:
+            result = self._game.step(actions)
+        except Exception as error:
+            add_note(error, f"Raised by the environment's step() {self._where}.")
+            raise
+        if type(result) is tuple and len(result) == 5:
+            obs, rewards, terminations, truncations, infos = result
+            if dict is type(obs) is type(rewards) is type(terminations) is type(truncations) is type(infos):
+                return result
+        return plain_step(result, self._where)
+
+    def _own_team_reward(self, rewards: dict[str, float], total: float) -> float:
+        """Return the team's reward as the environment computes it."""
+        reward = self._team_reward(rewards)
+        # Where an agent's own reward is not finite, that one is refused later
+        if type(reward) is not float or (isfinite(total) and not isfinite(reward)):
+            return plain_team_reward(reward, self._where)
+        return reward
+
+    def _record(self, agent_rewards: list[float], flags: Flags, infos: dict[str, Any] | None) -> StepRecord:
+        """Return the record of a step; without infos there are no masks to look for."""
+        visible = self._others.all_visible if flags is self._no_event else None
+        if visible is None:
+            visible = self._others.rows(flags.active, self._copy, self._t)
+        masks = None if infos is None else self._masks(infos).get("action_masks")
+        scripted_actions = self._scripted.actions() if self.scripted_action_spaces else None
+        return StepRecord(agent_rewards, flags, visible, masks, scripted_actions)
+
+    def _check_ends(self, obs: dict[str, Any], flags: Flags, ended: list[str]) -> None:
+        """Check the last observations of agents that left or, if the episode is over, of all."""
+        # The value at a time limit is computed from these, so they are checked in full
+        self._check_observations(obs, ended)
+        for agent, cut in zip(self.possible_agents, flags.truncated & flags.active, strict=True):
+            if cut and agent not in obs:
+                raise no_last_observation(agent, self._where)
+        self._check_possible_agents()
 
     def render(self) -> Any:
         """Return what the environment's own ``render()`` returns."""
         return self.env.render()
 
+    @property
+    def agents_in_play(self) -> list[str]:
+        """Names of the agents that are in play."""
+        return list(self._game.agents)
+
     def close(self) -> None:
         """Close the environment."""
-        self.env.close()
+        if hasattr(self.env, "close"):
+            self.env.close()
 
     def set_env_attr(self, name: str, value: Any) -> None:
         """
@@ -260,61 +279,37 @@ class JointEnv(gym.Env):
         }
 
     def _check_observations(self, obs: dict[str, Any], agents: list[str]) -> None:
-        where = place(self._copy, self._t)
+        where = self._where
         for agent in agents:
             if agent in obs:
                 check_observation(agent, obs[agent], self.observation_spaces[agent], where)
 
-    def _visible(self, active: np.ndarray) -> np.ndarray:
-        """Return whose actions each agent could observe, given which agents are active: bool ``[n, n_others]``."""
-        # An inactive agent neither observes nor is observed. Scripted others count as in play; an environment in which they
-        # cannot always be observed says so by its visibility()
-        if self.scripted_action_spaces:
-            in_play = np.concatenate([active, self._scripted_in_play])[self._others] & active[:, None]
-        else:
-            in_play = active[self._others] & active[:, None]
-        if self._visibility is None:
-            return in_play
-        rows = self._visibility()
-        unseen = np.zeros(self._others.shape[1], dtype=bool)
-        # Checking each row would take longer than all the rest, so only a failure leads to a search for its cause
-        try:
-            if rows.keys() <= self._names:
-                given = [rows.get(agent, unseen) for agent in self.possible_agents]
-                return np.array(given, dtype=bool).reshape(in_play.shape) & in_play
-        except (AttributeError, ValueError):
-            pass
-        raise self._wrong_visibility(rows)
+    @property
+    def _where(self) -> str:
+        return place(self._copy, self._t)
 
-    def _wrong_visibility(self, rows: Any) -> ValueError:
-        """Return the error that says what is wrong with the result of ``visibility()``."""
-        n_others, where = self._others.shape[1], place(self._copy, self._t)
-        scripted = f" and then the scripted others {list(self.scripted_action_spaces)}" if self.scripted_action_spaces else ""
-        rule = (
-            f"It must return a dict with {n_others} flags for each agent, the other agents in the order of possible_agents"
-            f"{scripted}; the agents are {self.possible_agents}."
-        )
-        if not isinstance(rows, Mapping):
-            return ValueError(f"visibility() returned a {type(rows).__name__} {where}. {rule}")
-        for agent, row in rows.items():
-            if agent not in self._names:
-                return ValueError(f"visibility() has an entry for {agent!r} {where}, which is not an agent. {rule}")
-            if np.size(row) != n_others:
-                return ValueError(f"visibility() has {np.size(row)} flags for {agent!r} {where}. {rule}")
-        return ValueError(f"visibility() returned something that cannot be read as flags {where}: {dict(rows)}. {rule}")
+    def _check_possible_agents(self) -> None:
+        """Check that the environment still knows all its agents: if it forgets one, that one never returns."""
+        names = getattr(self._game, "possible_agents", None)
+        if names is not None and len(names) != len(self.possible_agents):
+            raise ValueError(
+                f"possible_agents of {type(self.env).__name__} were {self.possible_agents} and are {list(names)}"
+                f" {self._where}: they must remain the same. If agents and possible_agents are one list, what is removed from"
+                " the one is gone from the other: begin episodes with self.agents = list(self.possible_agents)."
+            )
 
     def _masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
         """Return ``action_masks`` as in ``StepRecord``, or nothing as long as no info has held a mask."""
-        self._has_masks = self._has_masks or any("action_mask" in info for info in infos.values())
+        self._has_masks = self._has_masks or any("action_mask" in (infos.get(a) or ()) for a in self.possible_agents)
         if not self._has_masks:
             return {}
         masks = []
         for agent in self.possible_agents:
             width = self._mask_widths[agent]
-            mask = np.asarray(infos.get(agent, {}).get("action_mask", np.ones(width)), dtype=bool).ravel()
+            mask = np.asarray((infos.get(agent) or {}).get("action_mask", np.ones(width)), dtype=bool).ravel()
             if width and mask.size != width:
                 raise ValueError(
-                    f"The action mask of {agent!r} {place(self._copy, self._t)} must have {width} entries, one for each"
+                    f"The action mask of {agent!r} {self._where} must have {width} entries, one for each"
                     f" action, got {mask.size}."
                 )
             masks.append(mask[:width])
@@ -342,10 +337,6 @@ def step_and_reset(
         obs, reset_info = env.reset()
         masks = reset_info.get("action_masks")
     return obs, reward, done, record, masks, info
-
-
-def _no_flags(n_agents: int) -> Flags:
-    return Flags(np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool))
 
 
 def mask_width(space: spaces.Space) -> int:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
-from sb3_belief.vec_env.validation import check_spaces, not_finite, place
+from sb3_belief.vec_env.validation import check_spaces, n_choices, not_a_choice, not_finite, place
 from sb3_belief.vec_env.workers import WorkersVecEnv
 
 
@@ -53,6 +53,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
             raise
         if isinstance(self.venv, WorkersVecEnv):
             self.venv.set_members(self._observation_spaces, self._action_spaces, self.scripted_action_spaces)
+        self.reports_success = any(self.venv.get_attr("reports_success"))
         self._discrete = [isinstance(self._action_spaces[agent], spaces.Discrete) for agent in agents]
         self._mask_widths = [mask_width(self._action_spaces[agent]) for agent in agents]
         self._checks = StepChecks(agents, self._observation_spaces, self._action_spaces, self._mask_widths)
@@ -228,6 +229,9 @@ class StepChecks:
     ):
         self._agents, self._action_spaces = list(agents), action_spaces
         self._floats = [agent for agent in agents if np.issubdtype(observation_spaces[agent].dtype, np.floating)]
+        choices = {agent: n_choices(observation_spaces[agent]) for agent in agents}
+        self._choices = {agent: n for agent, n in choices.items() if n is not None}
+        self._observation_spaces = observation_spaces
         self._bounds = {agent: _bounds(action_spaces[agent]) for agent in agents}
         self._masked = [agent for agent, width in zip(agents, mask_widths, strict=True) if width]
         self._mask_starts = [sum(mask_widths[:i]) for i, width in enumerate(mask_widths) if width]
@@ -275,13 +279,19 @@ class StepChecks:
 
     def check_finite(self, obs: Mapping[str, np.ndarray], rewards: np.ndarray, steps: np.ndarray) -> None:
         """
-        Check that observations and rewards are finite.
+        Check that observations and rewards are finite, and discrete observations in their spaces.
 
         :param obs: Observations by agent, ``[num_envs, ...]``
         :param rewards: Rewards of the agents, float32 ``[num_envs, n]``
         :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        :raises ValueError: If a number is not finite
+        :raises ValueError: If a number is not finite, or an observation not in its space
         """
+        for agent, n in self._choices.items():
+            fits = (obs[agent] >= 0) & (obs[agent] < n)
+            if not fits.all():
+                copy = int(np.argmin(fits.reshape(len(steps), -1).all(axis=1)))
+                where = place(copy, int(steps[copy]) + 1)
+                raise not_a_choice(agent, obs[agent][copy], self._observation_spaces[agent], where)
         for agent in self._floats:
             if not _all_finite(obs[agent]):
                 copy = int(np.argmin(np.isfinite(obs[agent]).reshape(len(steps), -1).all(axis=1)))

@@ -6,6 +6,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.vec_env.validation import difference
+
 
 class ScriptedOthers:
     """
@@ -16,6 +18,7 @@ class ScriptedOthers:
 
     :param env: The environment
     :raises TypeError: If it has only one of the two members, or if one of them is of the wrong type
+    :raises ValueError: If two names are the same as text
     """
 
     def __init__(self, env: ParallelEnv):
@@ -24,16 +27,21 @@ class ScriptedOthers:
         if (given is None) != (last_actions is None):
             has, lacks = ("scripted_action_spaces", "scripted_actions()")[:: 1 if last_actions is None else -1]
             raise TypeError(
-                f"{type(env.unwrapped).__name__} has {has} but not {lacks}: an environment with scripted others has the"
-                " attribute scripted_action_spaces {name: space} and the method scripted_actions() -> {name: action of the"
-                " last step}; one without them has neither."
+                f"{type(getattr(env, 'unwrapped', env)).__name__} has {has} but not {lacks}: an environment with scripted"
+                " others has the attribute scripted_action_spaces {name: space} and the method scripted_actions() -> {name:"
+                " action of the last step}; one without them has neither."
             )
         if given is not None and not (hasattr(given, "items") and callable(last_actions)):
             raise TypeError(
                 "scripted_action_spaces must be a dict {name: space} and scripted_actions a method that returns"
                 f" {{name: action}}, got {type(given).__name__} and {type(last_actions).__name__}."
             )
-        self.action_spaces: dict[str, spaces.Space] = {} if given is None else dict(given.items())
+        own = {} if given is None else dict(given.items())
+        # Like agents, they are known by str(name)
+        self.action_spaces: dict[str, spaces.Space] = {str(name): space for name, space in own.items()}
+        if len(self.action_spaces) < len(own):
+            raise ValueError(f"Two scripted others of {list(own)} have the same name as text: give them different ones.")
+        self._own_names = dict(zip(own, self.action_spaces, strict=True))
         self._last_actions: Any = last_actions
 
     def actions(self) -> np.ndarray:
@@ -44,14 +52,13 @@ class ScriptedOthers:
         :raises ValueError: If an action is missing, has an unknown name or is not in its space
         """
         actions = self._last_actions()
-        if actions.keys() != self.action_spaces.keys():
-            missing = [name for name in self.action_spaces if name not in actions]
-            unknown = [name for name in actions if name not in self.action_spaces]
+        if actions.keys() != self._own_names.keys():
+            missing, unknown = difference(list(self._own_names), actions)
             raise ValueError(
                 f"scripted_actions() must return one action for each of {list(self.action_spaces)}: missing {missing},"
                 f" unknown {unknown}."
             )
-        return np.concatenate([_flat(name, space, actions[name]) for name, space in self.action_spaces.items()])
+        return np.concatenate([_flat(name, self.action_spaces[name], actions[own]) for own, name in self._own_names.items()])
 
 
 def optional_member(env: ParallelEnv, name: str) -> Any:
@@ -64,7 +71,7 @@ def optional_member(env: ParallelEnv, name: str) -> Any:
     """
     # Wrappers pass members on, but conversions to AEC and back do not, and some of SuperSuit's wrappers consist of such
     # conversions (e.g. dtype_v0). If visibility() got lost there, agents would observe more than they should
-    return getattr(env, name, getattr(env.unwrapped, name, None))
+    return getattr(env, name, getattr(getattr(env, "unwrapped", env), name, None))
 
 
 def _flat(name: str, space: spaces.Space, action: Any) -> np.ndarray:

@@ -25,7 +25,7 @@ class TeamVecEnv(VecEnv):
 
     A subclass implements ``_reset_joint`` and ``_step_joint``. This class does what every team environment needs besides: it
     checks the actions and monitors episodes (returns of the team and of each agent, monitor files). After every step
-    ``infos[e]`` holds plain arrays, never dictionaries by agent, because SB3's vectorisers deep-copy infos at each step:
+    ``infos[e]`` holds
 
     - ``agent_rewards`` float32 ``[n]``
     - ``visible`` bool ``[n, n-1+n_scripted]``: row i says whose action of this step agent i could observe (the other agents in
@@ -36,10 +36,16 @@ class TeamVecEnv(VecEnv):
       ``life_end``)
     - ``scripted_actions`` float32 ``[W_scripted]``, only with scripted others: their actions of this step, each encoded as by
       ``gymnasium.spaces.flatten``, side by side
+    - ``agent_infos`` {agent: dict}, only if the environment's infos hold more than a team reads of them: copies of what they
+      hold besides
+    - each key in ``agent_infos``, with the mean over the agents that report it where these are numbers, otherwise the value of
+      the first such agent; so ``VecMonitor(env, info_keywords=("fuel",))`` works
+    - what the environment's infos hold under names that are no agents, under these names
 
-    At the end of the team's episode it also holds ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool,
-    ``is_success`` bool (if the environment reports it), ``episode`` {"r": team return, "l": length, "t": seconds since the
-    start} and ``agent_episode_rewards`` float64 ``[n]``.
+    Entries of the environment never replace one of the others. At the end of the team's episode it also holds
+    ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool, ``is_success`` bool (if the environment reports it:
+    then at every end, False where it says nothing), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
+    and ``agent_episode_rewards`` float64 ``[n]``.
 
     :param num_envs: Number of copies
     :param possible_agents: Names of the agents; their order is the order of every array over agents
@@ -71,6 +77,8 @@ class TeamVecEnv(VecEnv):
             spaces.Dict({agent: observation_spaces[agent] for agent in self.possible_agents}),
             spaces.Dict({agent: action_spaces[agent] for agent in self.possible_agents}),
         )
+        #: Whether the environment reports ``is_success``, as far as is known
+        self.reports_success = False
         self.monitor_dir: str | None = None
         self._writers: list[ResultsWriter] = []
         self._actions: TeamObs = {}
@@ -219,6 +227,11 @@ class TeamVecEnv(VecEnv):
         self._lengths += 1
         for env_idx in np.flatnonzero(dones):
             info = infos[env_idx]
+            if "is_success" in info:
+                self.reports_success = True
+            elif self.reports_success:
+                # SB3's EvalCallback cannot save evaluations in which some episodes have it and some have not
+                info["is_success"] = False
             seconds = round(time.time() - self._t_start, 6)
             team_return, length = float(self._team_returns[env_idx]), int(self._lengths[env_idx])
             info["episode"] = {"r": team_return, "l": length, "t": seconds}

@@ -48,6 +48,17 @@ def check_spaces(
             )
         if not isinstance(observation_spaces[agent], allowed):
             raise ValueError(f"The observation space of {agent!r} is {observation_spaces[agent]}; allowed are {kinds}.")
+        if np.any(getattr(observation_spaces[agent], "start", 0)):
+            raise ValueError(
+                f"The observation space of {agent!r} is {observation_spaces[agent]}: SB3 encodes observations from 0, so the"
+                " environment must count from 0 too (start=0)."
+            )
+        actions = action_spaces[agent]
+        if isinstance(actions, spaces.Box) and not (np.isfinite(actions.low) & np.isfinite(actions.high)).all():
+            raise ValueError(
+                f"The action space of {agent!r} is {actions}, without finite bounds, in which no SB3 model can act: give it"
+                " bounds, e.g. Box(-1, 1, ...) with actions that the environment scales."
+            )
     both = [name for name in scripted_action_spaces if name in agents]
     if both:
         raise ValueError(
@@ -83,6 +94,7 @@ def check_wrappers(env: Any) -> None:
     :raises ValueError: For a wrapper that hides what a team has to know
     """
     while env is not None:
+        members = getattr(env, "__dict__", {})
         if type(env).__name__ == "black_death_par":
             raise ValueError(
                 "supersuit.black_death_v3 is not needed here, and hides which agents are still in play, and whether they"
@@ -90,7 +102,7 @@ def check_wrappers(env: Any) -> None:
                 " observation, and is known to be inactive. Leave it out."
             )
         # A conversion from AEC holds its environment under "aec_env"
-        env = vars(env).get("env") or vars(env).get("aec_env")
+        env = members.get("env") or members.get("aec_env")
 
 
 def check_names(
@@ -135,14 +147,69 @@ def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -
     :param where: Copy and step, in words
     :raises ValueError: If shape or numbers are not those of an observation
     """
-    array = np.asarray(value)
-    if array.shape != space.shape or array.dtype.kind not in "biuf":
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        # Lists of different lengths
+        array = np.asarray(value, dtype=object)
+    if array.shape != (space.shape or ()) or array.dtype.kind not in "biuf":
         raise ValueError(
             f"The observation of {agent!r} {where} has the shape {array.shape} and type {array.dtype}, but its observation"
             f" space is {space}: return an array of that shape, or correct observation_space({agent!r})."
         )
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise not_finite(f"observation of {agent!r}", array, where)
+    if array.dtype.kind == "f":
+        # What is finite in the environment's type may be too large for that of the space
+        with np.errstate(over="ignore"):
+            array = array.astype(space.dtype if np.issubdtype(space.dtype, np.floating) else array.dtype, copy=False)
+        if not np.isfinite(array).all():
+            raise not_finite(f"observation of {agent!r}", array, where)
+    choices = n_choices(space)
+    if choices is not None and not ((array >= 0) & (array < choices)).all():
+        raise not_a_choice(agent, array, space, where)
+
+
+def n_choices(space: spaces.Space) -> Any:
+    """
+    Return the number of values that an observation of a discrete space can have, each from 0.
+
+    :param space: An observation space
+    :return: A number, or an array of one for each dimension; None for a ``Box``
+    """
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.nvec
+    return 2 if isinstance(space, spaces.MultiBinary) else None
+
+
+def not_a_choice(agent: str, value: np.ndarray, space: spaces.Space, where: str) -> ValueError:
+    """
+    Return the error for an observation that is none of a discrete space.
+
+    :param agent: Name of the agent
+    :param value: Its observation
+    :param space: Its observation space
+    :param where: Copy and step, in words
+    """
+    return ValueError(
+        f"The observation of {agent!r} {where} is {value.tolist()}, which is not in its observation space {space}: return what"
+        f" lies in it, or correct observation_space({agent!r})."
+    )
+
+
+def no_last_observation(agent: str, where: str) -> ValueError:
+    """
+    Return the error for an agent that is truncated without a last observation.
+
+    :param agent: Name of the agent
+    :param where: Copy and step, in words
+    """
+    return ValueError(
+        f"The environment truncates {agent!r} {where} without returning a last observation of it. The return of a truncated"
+        " agent goes on, as far as learning is concerned, with the value of that observation: return one for each agent that"
+        " acted, as PettingZoo asks for (make the dicts of a step before agents is shortened), or report a termination where"
+        " nothing would follow."
+    )
 
 
 def not_finite(what: str, values: np.ndarray, where: str) -> ValueError:

@@ -112,6 +112,11 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         """
         return None
 
+    @property
+    def reports_success(self) -> bool:
+        """Whether the environment says at the end of an episode whether it was a success."""
+        return type(self)._is_success is not GymTupleEnv._is_success
+
     def _is_time_limit(self) -> bool:
         """
         Return whether a termination that the environment has just reported is in fact a time limit.

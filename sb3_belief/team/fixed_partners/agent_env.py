@@ -24,9 +24,11 @@ class AgentEnv(gym.Env):
 
     Any SB3 algorithm can learn in it, for instance to adapt to new partners. The learner gets exactly what it would get in a
     ``Team``: its observation, its reward, and in the info of a step ``others_actions`` float32 ``[W]`` (zero where not
-    visible), ``others_visible`` bool ``[n_others]`` and ``active`` bool; at the end of the team's episode also ``is_success``
-    if the environment reports it. The others are in the order of ``possible_agents`` without the learner, followed by the
-    environment's scripted others. ``action_masks()`` exists where the environment gives the learner masks.
+    visible), ``others_visible`` bool ``[n_others]`` and ``active`` bool, and what the environment's own info of the learner
+    holds besides, under the same keys. If the environment reports ``is_success``, it is there whenever an episode of the
+    learner ends: that of the team where the team's episode ends, too, and False where the team plays on. The others are in the
+    order of ``possible_agents`` without the learner, followed by the environment's scripted others. ``action_masks()`` exists
+    where the environment gives the learner masks.
 
     ``terminated`` and ``truncated`` describe the learner's own return. If it ends before the team's episode does and the
     learner stays (``life_end``), the next ``reset()`` without seed and options continues that episode, as SB3's
@@ -77,6 +79,8 @@ class AgentEnv(gym.Env):
         joint = JointEnv(_make(parallel_env, kwargs), visibility)
         self._team_env = ParallelTeamVecEnv([lambda: joint])
         agents = self._team_env.possible_agents
+        # Agents are known by their names as text
+        agent = str(agent)
         if agent not in agents:
             raise ValueError(f"There is no agent {agent!r} to learn; the environment has {agents}.")
         self.agent = agent
@@ -109,6 +113,7 @@ class AgentEnv(gym.Env):
             raise TypeError(
                 f"partners must be a dict {{agent: partner}} or the path of a team, not {type(partners).__name__}."
             )
+        partners = {str(name): partner for name, partner in partners.items()}
         missing = [name for name in self._others if name not in partners]
         if missing:
             raise ValueError(
@@ -128,6 +133,7 @@ class AgentEnv(gym.Env):
         :raises TypeError: If it cannot act
         :raises ValueError: If it does not fit, or if no partner acts for an agent of that name
         """
+        name = str(name)
         if name not in self._others:
             why = "the learner" if name == self.agent else "not an agent that a partner acts for"
             raise ValueError(f"{name!r} is {why}; partners act for {self._others}.")
@@ -173,7 +179,7 @@ class AgentEnv(gym.Env):
         """
         if not self._running:
             raise RuntimeError(f"The episode of {self.agent!r} is over, or none has begun: call reset() first.")
-        team_over, (observations, rewards, dones, infos) = self._step_team(action)
+        team_over, team_info, (observations, rewards, dones, infos) = self._step_team(action)
         obs, info = observations[0], infos[0]
         terminated = truncated = False
         if dones[0]:
@@ -181,8 +187,11 @@ class AgentEnv(gym.Env):
             obs, truncated = np.asarray(info.pop("terminal_observation"))[()], info.pop("TimeLimit.truncated")
             terminated = not truncated
             info.pop("episode", None)
-            if not team_over and self.agent not in self.parallel_env.agents:
-                info.update(self._play_to_the_end(action))
+            if not team_over and self.agent not in self._joint.agents_in_play:
+                team_info = self._play_to_the_end(action)
+            if "is_success" in team_info or self._team_env.reports_success:
+                # Always, since SB3's EvalCallback cannot save evaluations in which some episodes have it and some have not
+                info["is_success"] = team_info.get("is_success", False)
             self._running, self._next_is_ready = False, True
         return obs, float(rewards[0]), terminated, truncated, info
 
@@ -216,12 +225,13 @@ class AgentEnv(gym.Env):
     def _seed_of(self, name: str) -> int | None:
         return None if self._seed is None else agent_seed(self._seed, self._agents.index(name))
 
-    def _step_team(self, action: Any) -> tuple[bool, AgentStep]:
+    def _step_team(self, action: Any) -> tuple[bool, dict[str, Any], AgentStep]:
         """
         Step the team with the learner's action and those of the partners.
 
         :param action: The learner's action
-        :return: Whether the team's episode is over (the next one has then begun), and the learner's part of the step
+        :return: Whether the team's episode is over (the next one has then begun), the team's info, and the learner's part of
+            the step
         """
         actions = {self.agent: np.asarray(action)[None]}
         masks = self._team_env.action_masks() or {}
@@ -237,21 +247,21 @@ class AgentEnv(gym.Env):
             self._callers_rng.resume()
         step = self._team_env.step(actions)
         agent_steps = dict(zip(self._agents, self._splitter.split(actions, step), strict=True))
-        self._obs, _, team_dones, _ = step
+        self._obs, _, team_dones, team_infos = step
         self._ended = {name: bool(dones[0]) for name, (_, _, dones, _) in agent_steps.items()}
-        return bool(team_dones[0]), agent_steps[self.agent]
+        return bool(team_dones[0]), team_infos[0], agent_steps[self.agent]
 
     def _play_to_the_end(self, action: Any) -> dict[str, Any]:
         """
         Step the team to the end of its episode, after the learner has left.
 
         :param action: Any action of the learner; it is ignored
-        :return: ``is_success`` of the episode if the environment reports it, otherwise nothing
+        :return: The team's info of the last step
         """
-        team_over = False
+        team_over, team_info = False, dict[str, Any]()
         while not team_over:
-            team_over, (_, _, _, infos) = self._step_team(action)
-        return {key: infos[0][key] for key in ("is_success",) if key in infos[0]}
+            team_over, team_info, _ = self._step_team(action)
+        return team_info
 
 
 def _make(env: Any, kwargs: dict[str, Any]) -> Any:

@@ -1,0 +1,91 @@
+"""What a joint step meant for each agent: who was in play, whose return ended and whose was cut off."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Flags(NamedTuple):
+    """
+    What a joint step meant for each agent.
+
+    :param active: Whether it was in play when it acted, bool ``[n]``
+    :param life_end: Whether its own return ended (it terminated, or its life ended), bool ``[n]``
+    :param truncated: Whether its own return was cut off by a limit, bool ``[n]``; never together with ``life_end``
+    """
+
+    active: np.ndarray
+    life_end: np.ndarray
+    truncated: np.ndarray
+
+
+class Events(NamedTuple):
+    """
+    What happened to the agents in a joint step.
+
+    :param flags: What the step meant for each agent
+    :param ended: Whether all agents that acted have terminated or been truncated, and no other is in play now
+    :param left: Agents that left in this step
+    :param successes: The ``is_success`` of the agents that reported one
+    """
+
+    flags: Flags
+    ended: bool
+    left: list[str]
+    successes: list[bool]
+
+
+def no_flags(n_agents: int) -> Flags:
+    """
+    Return flags that are all False.
+
+    :param n_agents: Number of agents
+    """
+    return Flags(np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool))
+
+
+def find_events(
+    agents: Sequence[str],
+    before: Sequence[str],
+    after: Sequence[str],
+    terminations: Mapping[str, bool],
+    truncations: Mapping[str, bool],
+    infos: Mapping[str, Any],
+) -> Events:
+    """
+    Find out what happened to the agents.
+
+    :param agents: All agents
+    :param before: Those that acted
+    :param after: Those that are in play now
+    :param terminations: As the environment returned them
+    :param truncations: As the environment returned them
+    :param infos: The agents' infos, each a dict or something empty
+    :return: What happened
+    """
+    left, successes = [], []
+    active, life_end, truncated = flags = no_flags(len(agents))
+    ended = True
+    for i, agent in enumerate(agents):
+        if agent not in before:
+            # The others of a relay have only just entered
+            ended = ended and agent not in after
+            continue
+        agent_info = infos.get(agent) or {}
+        terminates, truncates = terminations.get(agent, False), truncations.get(agent, False)
+        has_left = agent not in after
+        # An agent that leaves for no stated reason has ended its life: there is nothing to bootstrap from
+        if terminates or agent_info.get("life_end", False) or (has_left and not truncates):
+            life_end[i] = True
+        elif truncates:
+            truncated[i] = True
+        if agent_info.get("active", True):
+            active[i] = True
+        if has_left:
+            left.append(agent)
+        if not (terminates or truncates):
+            ended = False
+        if agent_info.get("is_success") is not None:
+            successes.append(bool(agent_info["is_success"]))
+    return Events(flags, ended, left, successes)
