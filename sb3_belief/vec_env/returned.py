@@ -121,14 +121,14 @@ def plain_infos(infos: Mapping[str, Any], agents: Iterable[str], where: str) -> 
     """
     Return the agents' infos as dicts.
 
-    :param infos: A dict or None by agent; entries of other names are left out
+    :param infos: A dict or None by agent; entries of other names remain as they are
     :param agents: ``possible_agents``
     :param where: Copy and step, in words
     :raises ValueError: If the info of an agent is neither
     """
-    plain = {}
+    plain = dict(infos)
     for agent in agents:
-        info = infos.get(agent)
+        info = plain.pop(agent, None)
         if info is not None:
             if not isinstance(info, Mapping):
                 raise ValueError(f"The info of {agent!r} {where} is {_described(info)}: an agent's info is a dict.")
