@@ -1,6 +1,7 @@
 """
 The file of a saved team: a zip with ``team.json`` and ``agents/<agent>.zip`` for each agent, a normal SB3 zip that loads and
-predicts alone. A normalised agent also has ``agents/<agent>.vecnormalize.pkl``, as written by ``VecNormalize.save``.
+predicts alone. A normalised agent also has ``agents/<agent>.vecnormalize.pkl``, as written by ``VecNormalize.save``. A name
+that cannot be part of a path is quoted there (see ``file_name``), and ``team.json`` has it as it is.
 """
 
 import io
@@ -19,6 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_belief.common.file_names import file_name
 from sb3_belief.common.versions import versions
 
 # Version of the layout above
@@ -148,11 +150,14 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
             manifest = json.loads(archive.read("team.json"))
             if manifest.get("format") != FORMAT:
                 raise ValueError(f"{path} has the team format {manifest.get('format')!r}; this version reads {FORMAT}.")
-            models = {agent: archive.read(f"agents/{agent}.zip") for agent in manifest["agents"]}
+            # Earlier versions wrote all names as they are
+            files = {agent: f"agents/{file_name(agent)}" for agent in manifest["agents"]}
+            files |= {agent: f"agents/{agent}" for agent, file in files.items() if f"{file}.zip" not in names}
+            models = {agent: archive.read(f"{file}.zip") for agent, file in files.items()}
             statistics = {
-                agent: pickle.loads(archive.read(f"agents/{agent}.vecnormalize.pkl"))
-                for agent in manifest["agents"]
-                if f"agents/{agent}.vecnormalize.pkl" in names
+                agent: pickle.loads(archive.read(f"{file}.vecnormalize.pkl"))
+                for agent, file in files.items()
+                if f"{file}.vecnormalize.pkl" in names
             }
     except (zipfile.BadZipFile, json.JSONDecodeError, KeyError, EOFError, zlib.error, pickle.UnpicklingError) as error:
         raise ValueError(f"{path} is not a saved team, or it is damaged: {error}.") from error
@@ -188,9 +193,9 @@ def _write_archive(
         for agent, model in models.items():
             buffer = io.BytesIO()
             model.save(buffer)
-            archive.writestr(f"agents/{agent}.zip", buffer.getvalue())
+            archive.writestr(f"agents/{file_name(agent)}.zip", buffer.getvalue())
             if agent in statistics:
-                archive.writestr(f"agents/{agent}.vecnormalize.pkl", pickle.dumps(statistics[agent]))
+                archive.writestr(f"agents/{file_name(agent)}.vecnormalize.pkl", pickle.dumps(statistics[agent]))
 
 
 def _umask() -> int:

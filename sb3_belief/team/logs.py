@@ -11,6 +11,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, make_output_format
 from stable_baselines3.common.utils import get_latest_run_id
 
+from sb3_belief.common.file_names import file_name
+
 
 def _has_spread(key: str) -> bool:
     """
@@ -46,7 +48,8 @@ class TeamLog:
 
     :param agents: Names of the agents
     :param verbose: 1 or more prints the team's table to the standard output
-    :param log_dir: Folder for ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV files
+    :param log_dir: Folder for ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV files. A name
+        that cannot be part of a path is quoted (see ``file_name``)
     :param tensorboard_log: Folder for the TensorBoard runs ``Team_<k>`` (the team) and ``Team_<k>/agents/<agent>``; None for
         none
     """
@@ -60,7 +63,8 @@ class TeamLog:
             run_dir = os.path.join(tensorboard_log, f"Team_{get_latest_run_id(tensorboard_log, 'Team') + 1}")
         self.agent_loggers = {
             agent: Logger(
-                None if log_dir is None else os.path.join(log_dir, "agents", agent), _files(log_dir, run_dir, "agents", agent)
+                None if log_dir is None else os.path.join(log_dir, "agents", file_name(agent)),
+                _files(log_dir, run_dir, "agents", file_name(agent)),
             )
             for agent in agents
         }

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_belief.common.file_names import file_name
 from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
@@ -202,8 +203,8 @@ class TeamVecEnv(VecEnv):
         """
         Start writing one row per finished episode in SB3's monitor format.
 
-        ``monitor.csv`` holds the team's returns and ``agents/<agent>.monitor.csv`` each agent's own. Existing files are
-        overwritten.
+        ``monitor.csv`` holds the team's returns and ``agents/<agent>.monitor.csv`` each agent's own; a name that cannot be
+        part of a path is quoted (see ``file_name``). Existing files are overwritten.
 
         :param folder: Folder of the files; it is created if it does not exist
         """
@@ -212,7 +213,8 @@ class TeamVecEnv(VecEnv):
         self.monitor_dir = os.fspath(folder)
         header: dict[str, float | str] = {"t_start": self._t_start, "env_id": type(self).__name__}
         paths = [os.path.join(self.monitor_dir, Monitor.EXT)]
-        paths += [os.path.join(self.monitor_dir, "agents", f"{agent}.{Monitor.EXT}") for agent in self.possible_agents]
+        own = os.path.join(self.monitor_dir, "agents")
+        paths += [os.path.join(own, f"{file_name(agent)}.{Monitor.EXT}") for agent in self.possible_agents]
         self._writers = [ResultsWriter(path, header, extra_keys=("is_success",)) for path in paths]
 
     def _zero_episode_sums(self) -> None:

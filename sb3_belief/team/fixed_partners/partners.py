@@ -147,9 +147,10 @@ def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecN
     :raises ValueError: If it is damaged, lacks the agent, or holds a model of an algorithm that is not known here
     """
     file = os.fspath(path)
-    head, _, member = file.rpartition(":")
-    if head.endswith(".zip"):
-        file, agent = head, member
+    # The name of an agent may contain a colon, too
+    head, marker, member = file.partition(".zip:")
+    if marker:
+        file, agent = f"{head}.zip", member
     if not pathlib.Path(file).exists() and pathlib.Path(f"{file}.zip").exists():
         file = f"{file}.zip"
     if not pathlib.Path(file).is_file():

@@ -43,7 +43,7 @@ def test_a_lost_connection_under_the_vectoriser(faults):
     with pytest.warns(UserWarning, match="lost its connection"):
         _, _, dones, infos = env.step(stop)
     assert dones.tolist() == [False, True]
-    assert infos[1]["TimeLimit.truncated"] is True and infos[1]["truncated"].all() and "is_success" not in infos[1]
+    assert infos[1]["TimeLimit.truncated"] is True and infos[1]["truncated"].all() and infos[1]["is_success"] is False
     assert env.step(stop)[2].tolist() == [False, False]
 
 
