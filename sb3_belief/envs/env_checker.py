@@ -1,8 +1,11 @@
 """Check by random play whether an environment keeps the contract of a team, and report each fault with what to change."""
 
+import warnings
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from functools import partial
+from io import StringIO
 from typing import Any
 
 import cloudpickle
@@ -10,8 +13,15 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_belief.envs.random_play import PlayRecord, RandomPlayer, play_randomly
 from sb3_belief.envs.registry import spec
+from sb3_belief.envs.suites import load_attribute
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
+from sb3_belief.vec_env.user_env import UserEnv, check_interface
 from sb3_belief.vec_env.validation import check_spaces
+
+# Named, not imported, as the registry names environments: a team is built on what stands here
+_TRIAL = "sb3_belief.team.trial:try_to_learn"
+# Steps of PettingZoo's own test
+_PETTINGZOO_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -66,10 +76,13 @@ def check_team_env(
     env: str | Callable[..., ParallelEnv], env_kwargs: Mapping[str, Any] | None = None, n_steps: int = 500, seed: int = 0
 ) -> Report:
     """
-    Check an environment by playing it with random actions that its masks allow.
+    Check an environment: by PettingZoo's own test, by playing it with random actions that its masks allow, and by a small team
+    that learns in it for a moment.
 
-    The check covers what a team needs: spaces, names of agents, seeding, masks, visibility, ``active``, ``life_end``, ends of
-    episodes, infos, saving and restoring the state, and pickling.
+    Random play covers what a team needs: spaces, names of agents, seeding, masks, visibility, ``active``, ``life_end``, ends
+    of episodes, infos, saving and restoring the state, and pickling. Where all is well, a team of ``BeliefPPO`` plays and
+    learns, so that an environment without failures is one in which a team can be trained. What PettingZoo's test says are
+    notes, since a team asks for less in some respects.
 
     :param env: An id, or a callable that returns a PettingZoo ``ParallelEnv``, as ``make_team_env`` takes them
     :param env_kwargs: Keyword arguments of the environment
@@ -93,18 +106,20 @@ def check_team_env(
             record = play_randomly(first, n_steps, seed)
             for topic, text in record.faults.items():
                 report.add(topic, "FAIL", text)
+            _report_pettingzoo(make, bool(record.masked), report)
             # With the fault "play" the environment could not be stepped, so there is nothing to compare or describe
             if "play" not in record.faults:
                 _report_seeding(make, first, record, seed, report)
                 _report_play(record, report)
                 _report_state(first, seed, report)
             _report_pickling(make, report)
+            _report_trial(make, n_steps, seed, report)
     finally:
         first.close()
     return report
 
 
-def _make_env(make: Callable[[], Any], report: Report) -> ParallelEnv | None:
+def _make_env(make: Callable[[], Any], report: Report) -> UserEnv | None:
     try:
         env = make()
     except Exception as error:
@@ -113,31 +128,40 @@ def _make_env(make: Callable[[], Any], report: Report) -> ParallelEnv | None:
     if isinstance(env, AECEnv):
         change = "wrap it: sb3_belief.envs.to_parallel(env)"
         report.add("making", "FAIL", f"it is an AEC environment, in which agents act in turn. Change: {change}.")
-    elif not isinstance(env, ParallelEnv):
+        return None
+    try:
+        check_interface(env)
+    except TypeError:
         change = "return an object of a subclass of pettingzoo.ParallelEnv"
         report.add("making", "FAIL", f"it returns a {type(env).__name__}. Change: {change}.")
     else:
         # Copies that are one and the same object would step each other
         other = make()
         if other is not env:
-            other.close()
-            return env
+            return _known_env(env, report)
         report.add("making", "FAIL", "it returns the same environment each time. Change: make a new one at each call.")
     return None
 
 
-def _report_spaces(env: ParallelEnv, report: Report) -> bool:
+def _known_env(env: Any, report: Report) -> UserEnv | None:
+    """Return the environment with names and spaces as a team knows them, if they can be known."""
     try:
-        agents = list(env.possible_agents)
-        observation_spaces = {agent: env.observation_space(agent) for agent in agents}
-        action_spaces = {agent: env.action_space(agent) for agent in agents}
-        check_spaces(agents, observation_spaces, action_spaces, ScriptedOthers(env).action_spaces)
+        user_env = UserEnv(env)
+        spaces_of = user_env.observation_spaces, user_env.action_spaces
+        check_spaces(user_env.possible_agents, *spaces_of, ScriptedOthers(env).action_spaces)
     except Exception as error:
         change = "define possible_agents, observation_space(agent) and action_space(agent) before the first reset"
         report.add("spaces", "FAIL", f"{_describe_error(error)}. Change: {change}, with spaces that a team supports.")
-        return False
+        return None
+    return user_env
+
+
+def _report_spaces(env: UserEnv, report: Report) -> bool:
+    agents, observation_spaces, action_spaces = env.possible_agents, env.observation_spaces, env.action_spaces
+    again = UserEnv(env.env)
     for agent in agents:
-        if env.observation_space(agent) != observation_spaces[agent] or env.action_space(agent) != action_spaces[agent]:
+        given = again.observation_spaces.get(agent), again.action_spaces.get(agent)
+        if given != (observation_spaces[agent], action_spaces[agent]):
             change = "make them once and return the same objects"
             report.add("spaces", "FAIL", f"those of {agent!r} differ from call to call. Change: {change}.")
             return False
@@ -146,12 +170,12 @@ def _report_spaces(env: ParallelEnv, report: Report) -> bool:
     return True
 
 
-def _report_seeding(make: Callable[[], Any], env: ParallelEnv, record: PlayRecord, seed: int, report: Report) -> None:
+def _report_seeding(make: Callable[[], Any], env: UserEnv, record: PlayRecord, seed: int, report: Report) -> None:
     n_steps = min(sum(entry[0] != "reset" for entry in record.trace), 60)
     try:
         # The same environment reveals what an episode leaves behind, a new one what depends on the process or the instance
         again = play_randomly(env, n_steps, seed).trace
-        other = make()
+        other = UserEnv(make())
         fresh = play_randomly(other, n_steps, seed).trace
         different = play_randomly(other, n_steps, seed + 1).trace
         other.close()
@@ -192,9 +216,10 @@ def _report_play(record: PlayRecord, report: Report) -> None:
         report.add("infos", "ok", f"keys outside this contract: {', '.join(sorted(record.other_keys)) or 'none'}")
     if "ends" not in faults:
         report.add("ends", *record.ends_summary())
+        report.add("success", *record.success_summary())
 
 
-def _report_state(env: ParallelEnv, seed: int, report: Report) -> None:
+def _report_state(env: UserEnv, seed: int, report: Report) -> None:
     get_state, set_state = optional_member(env, "get_state"), optional_member(env, "set_state")
     if get_state is None or set_state is None:
         report.add("state", "note", "no get_state() and set_state(): a saved run can be resumed, but not exactly")
@@ -233,13 +258,49 @@ def _continue_play(player: RandomPlayer) -> list[tuple]:
 
 def _report_pickling(make: Callable[[], Any], report: Report) -> None:
     try:
-        cloudpickle.loads(cloudpickle.dumps(make))().close()
+        UserEnv(cloudpickle.loads(cloudpickle.dumps(make))()).close()
     except Exception as error:
         change = "keep open files, locks and environments out of the callable and its arguments"
         text = f"the callable cannot be sent to a worker process: {_describe_error(error)}"
         report.add("pickling", "FAIL", f"{text}. Change: {change}.")
     else:
         report.add("pickling", "ok", "worker processes can make it")
+
+
+def _report_pettingzoo(make: Callable[[], Any], masked: bool, report: Report) -> None:
+    """Run PettingZoo's own test in an environment of its own, and report what it says."""
+    if masked:
+        report.add("pettingzoo", "note", "parallel_api_test() was left out, since it knows no masks in infos")
+        return
+    # Imported here, since PettingZoo's tests need more than its environments do
+    from pettingzoo.test import parallel_api_test
+
+    said: list[str] = []
+    with warnings.catch_warnings(record=True) as caught, redirect_stdout(StringIO()):
+        warnings.simplefilter("always")
+        try:
+            parallel_api_test(make(), _PETTINGZOO_STEPS)
+        except Exception as error:
+            # Many of its assertions have no text
+            said.append(f"fails with {_describe_error(error)}")
+    said += dict.fromkeys(f"warns: {warning.message}" for warning in caught)
+    for text in said:
+        report.add("pettingzoo", "note", f"parallel_api_test() {text}")
+    if not said:
+        report.add("pettingzoo", "ok", "parallel_api_test() passes")
+
+
+def _report_trial(make: Callable[[], Any], n_steps: int, seed: int, report: Report) -> None:
+    if report.failures:
+        report.add("training", "note", "not tried before the failures are mended")
+        return
+    try:
+        load_attribute(_TRIAL)(make, n_steps, seed)
+    except Exception as error:
+        change = "mend what it says; a training would end there"
+        report.add("training", "FAIL", f"a small team fails with {_describe_error(error)}. Change: {change}.")
+    else:
+        report.add("training", "ok", "a small team of BeliefPPO learns")
 
 
 def _describe_error(error: BaseException) -> str:

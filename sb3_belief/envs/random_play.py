@@ -9,7 +9,9 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.vec_env.joint_env import mask_width
+from sb3_belief.vec_env.returned import plain_infos, plain_reset, plain_step
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
+from sb3_belief.vec_env.user_env import UserEnv, separate_agents
 
 # The keys of infos that belong to the contract
 FLAGS = ("active", "life_end", "is_success")
@@ -25,6 +27,7 @@ class PlayRecord:
     :param faults: {topic: the first fault and what to change}
     :param lengths: Length in steps of each finished episode
     :param endings: ``"terminated"`` or ``"truncated"`` for each finished episode
+    :param successes: For each finished episode whether the environment said if it was a success
     :param rewards: The rewards of all agents
     :param other_keys: Keys of infos that do not belong to the contract
     :param masked: Agents that have action masks
@@ -43,6 +46,7 @@ class PlayRecord:
     faults: dict[str, str] = field(default_factory=dict)
     lengths: list[int] = field(default_factory=list)
     endings: list[str] = field(default_factory=list)
+    successes: list[bool] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     other_keys: set[str] = field(default_factory=set)
     masked: set[str] = field(default_factory=set)
@@ -88,6 +92,17 @@ class PlayRecord:
         symmetry = f"one-sided in {one_sided:.1%} of the pairs of agents" if self.n_one_sided else "always mutual"
         return "ok", f"{share:.1%} of the others' actions are visible, {symmetry}"
 
+    def success_summary(self) -> tuple[str, str]:
+        """
+        Describe at how many ends the environment said whether the episode was a success.
+
+        :return: Verdict and text for the report
+        """
+        if any(self.successes) and not all(self.successes):
+            change = "the others count as False; better return it at each end, False where the team did not succeed"
+            return "note", f"is_success at {sum(self.successes)} of {len(self.successes)} ends only: {change}"
+        return "ok", "is_success at each end" if any(self.successes) else "the environment does not report is_success"
+
     def ends_summary(self) -> tuple[str, str]:
         """
         Describe how episodes ended.
@@ -121,7 +136,7 @@ def play_randomly(env: ParallelEnv, n_steps: int, seed: int, action_seed: int = 
     player = RandomPlayer(env, action_seed)
     if player.reset(seed):
         for _ in range(n_steps):
-            if not (player.step() if env.agents else player.reset(None) and player.step()):
+            if not (player.step() if player.env.agents else player.reset(None) and player.step()):
                 break
     return player.record
 
@@ -135,12 +150,13 @@ class RandomPlayer:
     """
 
     def __init__(self, env: ParallelEnv, seed: int):
-        self.env, self.record, self.rng = env, PlayRecord(), np.random.default_rng(seed)
-        self.agents = list(env.possible_agents)
-        self.observation_spaces = {agent: env.observation_space(agent) for agent in self.agents}
-        self.action_spaces = {agent: env.action_space(agent) for agent in self.agents}
+        self.env = user_env = env if isinstance(env, UserEnv) else UserEnv(env)
+        self.record, self.rng = PlayRecord(), np.random.default_rng(seed)
+        self.agents = list(user_env.possible_agents)
+        self.observation_spaces = {agent: user_env.observation_space(agent) for agent in self.agents}
+        self.action_spaces = {agent: user_env.action_space(agent) for agent in self.agents}
         self.mask_widths = {agent: mask_width(space) for agent, space in self.action_spaces.items()}
-        self.visibility = optional_member(env, "visibility")
+        self.visibility, _ = user_env.renamed_members(optional_member(env, "visibility"), None)
         self.scripted = ScriptedOthers(env)
         self.masks: dict[str, np.ndarray] = {}
         self.t = 0
@@ -154,8 +170,9 @@ class RandomPlayer:
         """
         record, self.t = self.record, 0
         try:
-            obs, infos = self.env.reset(seed=seed)
-            _require_dicts(obs, infos)
+            obs, infos = plain_reset(self.env.reset(seed=seed), "at reset")
+            infos = plain_infos(infos, self.agents, "at reset")
+            separate_agents(self.env.env)
             playing = list(self.env.agents)
             self._check_observations(obs, playing)
             self._check_infos(infos, [])
@@ -180,8 +197,8 @@ class RandomPlayer:
         record, before = self.record, list(self.env.agents)
         actions = {agent: sample_action(self.action_spaces[agent], self.masks.get(agent), self.rng) for agent in before}
         try:
-            obs, rewards, terminations, truncations, infos = self.env.step(actions)
-            _require_dicts(obs, rewards, terminations, truncations, infos)
+            obs, rewards, terminations, truncations, infos = plain_step(self.env.step(actions), f"at step {self.t}")
+            infos = plain_infos(infos, self.agents, f"at step {self.t}")
             after = list(self.env.agents)
             if not self._check_agents("agents", after):
                 return False
@@ -199,12 +216,13 @@ class RandomPlayer:
             )
             record.fault("play", f"step {self.t} fails with {type(error).__name__}: {error}", change)
             return False
-        flags = [(bool(terminations.get(agent)), bool(truncations.get(agent))) for agent in before]
+        flags = [(np.any(terminations.get(agent)), np.any(truncations.get(agent))) for agent in before]
         # repr(), because a faulty value may be of any type, and nan would differ from itself
         numbers = [repr(rewards.get(agent)) for agent in before]
         record.trace.append((before, after, numbers, flags, visible, scripted, *self._as_bytes(obs, infos)))
         if not after:
             record.lengths.append(self.t)
+            record.successes.append(any("is_success" in infos.get(agent, {}) for agent in before))
             record.endings.append("truncated" if any(truncated for _, truncated in flags) else "terminated")
         return True
 
@@ -228,8 +246,7 @@ class RandomPlayer:
                 change = "return one for each agent that acted, including the last one of an agent that leaves"
                 self.record.fault("observations", f"none for {agent!r} at step {self.t}", change)
                 continue
-            why = misfit(self.observation_spaces[agent], obs[agent])
-            if why:
+            if why := misfit(self.observation_spaces[agent], obs[agent]):
                 change = f"return what lies in {self.observation_spaces[agent]}, or correct observation_space({agent!r})"
                 self.record.fault("observations", f"that of {agent!r} at step {self.t} {why}", change)
 
@@ -247,10 +264,10 @@ class RandomPlayer:
         self, terminations: Mapping[str, Any], truncations: Mapping[str, Any], before: list[str], after: list[str]
     ) -> None:
         for agent in before:
-            flags = [part.get(agent) for part in (terminations, truncations)]
+            flags = [np.asarray(part.get(agent)) for part in (terminations, truncations)]
             where = f"{agent!r} at step {self.t}"
-            if not all(isinstance(flag, bool | np.bool_) for flag in flags):
-                what = f"terminations and truncations are {flags} for {where}"
+            if not all(flag.size == 1 and flag.dtype.kind in "biu" for flag in flags):
+                what = f"terminations and truncations are {[flag.tolist() for flag in flags]} for {where}"
                 self.record.fault("ends", what, "return True or False for each agent")
             elif all(flags):
                 change = "a termination says that nothing follows, a truncation that a limit ended the episode: choose one"
@@ -261,12 +278,8 @@ class RandomPlayer:
                 self.record.fault("ends", f"{where} {state}", change)
 
     def _check_infos(self, infos: Mapping[str, Any], acted: list[str]) -> None:
-        self._check_agents("infos", infos)
-        for agent, info in infos.items():
-            if not isinstance(info, Mapping):
-                change = "infos is a dict of dicts by agent"
-                self.record.fault("infos", f"that of {agent!r} at step {self.t} is a {type(info).__name__}", change)
-                return
+        for agent in self.agents:
+            info = infos.get(agent, {})
             self.record.other_keys |= {str(key) for key in info} - set(KEYS)
             for key in FLAGS:
                 if key in info and not isinstance(info[key], bool | np.bool_):
@@ -335,12 +348,6 @@ class RandomPlayer:
         self.record.n_pairs += len(pairs)
         self.record.n_one_sided += sum(sees[pair] != sees[pair[::-1]] for pair in pairs)
         return b"".join(np.asarray(rows[agent], dtype=bool).tobytes() for agent in self.agents if agent in rows)
-
-
-def _require_dicts(*parts: Any) -> None:
-    for part in parts:
-        if not isinstance(part, Mapping):
-            raise TypeError(f"a {type(part).__name__} is not a dict by agent")
 
 
 def sample_action(space: spaces.Space, mask: np.ndarray | None, rng: np.random.Generator) -> Any:

@@ -73,7 +73,7 @@ class JointEnv(gym.Env):
     """
 
     def __init__(self, env: ParallelEnv, visibility: Visibility | None = None, copy: int = 0):
-        user_env = UserEnv(env)
+        self._user_env = user_env = UserEnv(env)
         self.env = env
         # What is stepped: mostly the environment itself
         self._game: Any = user_env if user_env.adapts else env
@@ -253,8 +253,7 @@ class JointEnv(gym.Env):
 
     def close(self) -> None:
         """Close the environment."""
-        if hasattr(self.env, "close"):
-            self.env.close()
+        self._user_env.close()
 
     def set_env_attr(self, name: str, value: Any) -> None:
         """

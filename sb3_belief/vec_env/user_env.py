@@ -14,7 +14,7 @@ from sb3_belief.vec_env.validation import check_wrappers
 _METHODS = ("reset", "step", "observation_space", "action_space")
 
 
-class UserEnv:
+class UserEnv(ParallelEnv):
     """
     The environment of a user behind the interface of a ``ParallelEnv`` whose agents have strings as names.
 
@@ -33,6 +33,7 @@ class UserEnv:
         check_wrappers(env)
         self.env = env
         self._takes_seed, self._takes_options = (_takes(env.reset, name) for name in ("seed", "options"))
+        self.metadata, self.render_mode = getattr(env, "metadata", {}), getattr(env, "render_mode", None)
         self._warned = False
         try:
             names, given = self._members()
@@ -48,12 +49,19 @@ class UserEnv:
                 " give them different ones."
             )
         self.possible_agents = [str(name) for name in names]
-        self.observation_spaces = {self._names[name]: _with_shape(both[0]) for name, both in given.items()}
-        self.action_spaces = {self._names[name]: _one_dimensional(both[1]) for name, both in given.items()}
+        self.observation_spaces: dict[str, spaces.Space] = {}
+        self.action_spaces: dict[str, spaces.Space] = {}
         # Shapes that the environment gives and takes, where they are not those of the spaces
-        changed = [(self._names[name], both) for name, both in given.items()]
-        self._obs_shapes = {a: both[0].shape for a, both in changed if self.observation_spaces[a] is not both[0]}
-        self._action_shapes = {a: both[1].shape for a, both in changed if self.action_spaces[a] is not both[1]}
+        self._obs_shapes: dict[str, Any] = {}
+        self._action_shapes: dict[str, Any] = {}
+        for name, (observations, actions) in given.items():
+            agent = self._names[name]
+            self.observation_spaces[agent] = _with_shape(observations)
+            self.action_spaces[agent] = _one_dimensional(actions)
+            if self.observation_spaces[agent] is not observations:
+                self._obs_shapes[agent] = observations.shape
+            if self.action_spaces[agent] is not actions:
+                self._action_shapes[agent] = actions.shape
         #: Whether the names are not those of the environment
         self.renames = any(not isinstance(name, str) for name in names)
         #: Whether anything differs from the environment itself, so that it has to be stepped through this object
@@ -125,7 +133,8 @@ class UserEnv:
             name = type(self.unwrapped).__name__
             raise ValueError(f"{name} takes no options: its reset() has no such argument, got {dict(options)}.")
         result = self.env.reset(**arguments)
-        if not hasattr(self, "adapts"):
+        if "adapts" not in vars(self):
+            # The first reset is for agents and spaces alone
             return result
         if isinstance(result, tuple):
             return tuple(self._translated(part, reshapes=i == 0) for i, part in enumerate(result))
@@ -146,6 +155,21 @@ class UserEnv:
         if not isinstance(result, tuple):
             return result
         return tuple(self._translated(part, reshapes=i == 0) for i, part in enumerate(result))
+
+    def render(self) -> Any:
+        """Return what the environment's own ``render()`` returns."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the environment, if it can be closed."""
+        if hasattr(self.env, "close"):
+            self.env.close()
+
+    def __getattr__(self, name: str) -> Any:
+        # Private names are left out: pickle and copy ask for some of them before ``env`` is set
+        if name.startswith("_") or name == "env":
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(self.env, name)
 
     def renamed_members(self, visibility: Any, team_reward: Any) -> tuple[Any, Any]:
         """

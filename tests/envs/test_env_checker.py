@@ -95,7 +95,7 @@ class Faulty(ToyEnv):
         terminations["agent_1"] = 0.0
 
     def no_info(self, obs, rewards, terminations, truncations, infos):
-        infos["agent_1"] = None
+        infos["agent_1"] = [3]
 
     def odd_life_end(self, obs, rewards, terminations, truncations, infos):
         infos["agent_1"] = {"life_end": "yes"}
@@ -122,7 +122,7 @@ class Faulty(ToyEnv):
         ("stays", "ends", "'agent_1' at step 3 has ended but is still in agents"),
         ("sneaks_away", "ends", "'agent_1' at step 3 left agents without termination or truncation"),
         ("numbers_for_flags", "ends", "terminations and truncations are [0.0, False] for 'agent_1' at step 3"),
-        ("no_info", "infos", "that of 'agent_1' at step 3 is a NoneType"),
+        ("no_info", "play", "The info of 'agent_1' at step 3 is a list of 1"),
         ("odd_life_end", "flags", "infos['agent_1']['life_end'] at step 3 is 'yes'"),
         ("late_mask", "masks", "the first one of 'agent_1' comes at step 3"),
         ("raises", "play", "step 3 fails with ArithmeticError: the toy broke"),
@@ -273,10 +273,10 @@ class Fickle(ToyEnv):
 
 
 class ResetsWrong(ToyEnv):
-    """A ``ToyEnv`` whose ``reset()`` returns no infos."""
+    """A ``ToyEnv`` whose ``reset()`` returns too much."""
 
     def reset(self, seed=None, options=None):
-        return super().reset(seed)[0]
+        return *super().reset(seed), {}
 
 
 class NobodyPlays(ToyEnv):
@@ -296,7 +296,7 @@ ONE = ToyEnv()
     [
         (Nested, "spaces", "The observation space of 'agent_0' is nested"),
         (Fickle, "spaces", "differ from call to call. Change: make them once"),
-        (ResetsWrong, "play", "reset() fails with"),
+        (ResetsWrong, "play", "reset() fails with ValueError: reset() returned a tuple of 3"),
         (NobodyPlays, "play", "agents is empty after reset()"),
         (simple_spread_v3.env, "making", "Change: wrap it: sb3_belief.envs.to_parallel(env)"),
         (dict, "making", "it returns a dict. Change: return an object of a subclass of pettingzoo.ParallelEnv"),
