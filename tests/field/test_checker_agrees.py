@@ -11,6 +11,7 @@ from sb3_belief import BeliefPPO, envs
 from sb3_belief.envs import env_checker
 from tests.field import test_own_infos, test_success_at_some_ends, test_unusual_returns, test_who_is_in_play
 from tests.field.test_names import NUMBERS, TUPLES, Named
+from tests.field.unusual import CLEAR, InfoOfTheGame
 from tests.field.walkers import Walkers
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 
@@ -27,7 +28,7 @@ def with_fault(fault):
 
 class Square(Walkers):
     obs_space = spaces.Box(0, 1, (), np.float32)
-    act_space = spaces.MultiDiscrete([[2, 3], [4, 2]])
+    act_space = spaces.MultiDiscrete(np.array([[2, 3], [4, 2]]))
 
     def observe(self, agent):
         return np.float32(0.5)
@@ -107,7 +108,7 @@ class Late(Walkers):
 
 
 GOOD = {
-    **{kind.__name__: kind for kind in test_unusual_returns.CLEAR},
+    **{kind.__name__: kind for kind in CLEAR},
     "walkers": Walkers,
     "relay": partial(Shifts, ["0", "0", "1", "1", ""]),
     "relay by limits": partial(Shifts, ["0", "1", "1", ""], cut=True),
@@ -199,5 +200,5 @@ def test_pettingzoos_own_test_is_run():
     text = str(envs.check_team_env(Revived, n_steps=12))
     assert "note  pettingzoo: parallel_api_test() fails with AssertionError: observation_space should return the exact" in text
     assert "ok    pettingzoo: parallel_api_test() passes" in str(envs.check_team_env(Walkers, n_steps=12))
-    text = str(envs.check_team_env(test_unusual_returns.InfoOfTheGame, n_steps=12))
+    text = str(envs.check_team_env(InfoOfTheGame, n_steps=12))
     assert "note  pettingzoo: parallel_api_test() warns: Agent was given info but was dead last turn" in text

@@ -128,7 +128,7 @@ def test_an_agent_of_a_shrinking_list_returns(kind):
 
 def test_a_list_that_shrinks_elsewhere_is_refused():
     class Alive(OneList):
-        agents = property(lambda self: self.possible_agents, lambda self, agents: None)  # type: ignore[assignment]
+        agents = property(lambda self: self.possible_agents, lambda self, agents: None)
 
     message = (
         r"possible_agents of Alive were \['walker_0', 'walker_1'\] and are \['walker_1'\] in environment copy 0 at step 2:"
