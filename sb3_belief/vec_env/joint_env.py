@@ -11,7 +11,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
-from sb3_belief.vec_env.events import Flags, find_events, no_flags
+from sb3_belief.vec_env.events import Events, Flags, find_events, no_flags
 from sb3_belief.vec_env.own_infos import own_infos
 from sb3_belief.vec_env.returned import (
     StepParts,
@@ -30,8 +30,7 @@ from sb3_belief.vec_env.visible import VisibleOthers
 
 # Says whose action of the last step each agent could observe: bool [n_others] by agent
 Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
-# Types of the infos of a step, and of the sum of its rewards if these are numbers
-_DICT = {dict}
+# Types of the sum of rewards, if these are numbers
 _NUMBERS = {float, int, np.float64, np.float32, np.int64, np.int32}
 
 
@@ -154,44 +153,57 @@ class JointEnv(gym.Env):
         """
         before = list(self._game.agents)
         self._t += 1
-        obs, rewards, terminations, truncations, infos = self._step_game({agent: action[agent] for agent in before})
+        try:
+            result = self._game.step({agent: action[agent] for agent in before})
+        except Exception as error:
+            add_note(error, f"Raised by the environment's step() {self._where}.")
+            raise
         after = list(self._game.agents)
         agents = self.possible_agents
-        # Here and below, a cheap comparison decides whether something has to be converted, or the cause of a fault found
-        if obs.keys() != self._names or rewards.keys() != self._names or after != agents:
+        # Here and below, a cheap look decides whether something has to be converted, or the cause of a fault found
+        try:
+            obs, rewards, terminations, truncations, infos = result
+            any_info = any(infos.values())
+            any_end = True in terminations.values() or True in truncations.values()
+            agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
+            total = sum(agent_rewards)
+            as_usual = obs.keys() == self._names and rewards.keys() == self._names and after == agents
+        except (AttributeError, TypeError, ValueError):
+            total = None
+        if type(total) not in _NUMBERS:
+            any_info = any_end = True
+            as_usual = False
+            obs, rewards, terminations, truncations, infos = self._plain(result)
+            agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
+            total = sum(agent_rewards)
+        if not as_usual:
             check_names(agents, before, after, {"observations": obs, "rewards": rewards}, self._where)
         for agent, shape in self._shapes:
             if agent in obs and getattr(obs[agent], "shape", None) != shape:
                 self._check_observations(obs, [agent])
-        agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
-        try:
-            total = sum(agent_rewards)
-            any_info = any(infos.values())
-            any_end = True in terminations.values() or True in truncations.values()
-        except (TypeError, ValueError):
-            # One of them is no number, or an array of several
-            total, any_info, any_end = None, True, True
-            terminations = plain_flags("terminations", terminations, agents, self._where)
-            truncations = plain_flags("truncations", truncations, agents, self._where)
-        if type(total) not in _NUMBERS:
-            rewards = plain_rewards(rewards, self._where)
-            agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
-            total = sum(agent_rewards)
         team_reward = float(total / len(agents)) if self._team_reward is None else self._own_team_reward(rewards, total)
         # In nearly all steps of nearly all environments nothing happens to any agent, and the loop over agents is saved
-        if not (any_info or any_end or len(after) < len(agents)):
-            record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
-            return obs, team_reward, False, False, {"joint": record}
-        if any_info and set(map(type, infos.values())) != _DICT:
-            infos = plain_infos(infos, agents, self._where)
-        events = find_events(agents, before, after, terminations, truncations, infos)
-        flags, left = events.flags, events.left
-        done = events.ended or not after
+        if any_info or any_end or len(after) < len(agents):
+            try:
+                info = own_infos(infos, self.action_spaces) if any_info else {}
+            except AttributeError:
+                # The info of an agent is no dict
+                infos = plain_infos(infos, agents, self._where)
+                info = own_infos(infos, self.action_spaces)
+            events = find_events(agents, before, after, terminations, truncations, infos)
+            info["joint"] = self._record(agent_rewards, events.flags, infos if any_info or self._has_masks else None)
+            return self._after_events(obs, team_reward, events, not after, info)
+        record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
+        return obs, team_reward, False, False, {"joint": record}
 
-        info: dict[str, Any] = own_infos(infos, self.action_spaces) if any_info else {}
-        info["joint"] = self._record(agent_rewards, flags, infos if any_info or self._has_masks else None)
+    def _after_events(
+        self, obs: dict[str, Any], team_reward: float, events: Events, all_left: bool, info: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Return a step in which something has happened to an agent."""
+        flags, left = events.flags, events.left
+        done = events.ended or all_left
         if done or left:
-            self._check_ends(obs, flags, agents if done else left)
+            self._check_ends(obs, flags, self.possible_agents if done else left)
         observations = self._observations(obs)
         if done:
             if events.successes:
@@ -203,18 +215,17 @@ class JointEnv(gym.Env):
         cut = done and bool(flags.truncated.any())
         return observations, team_reward, done and not cut, cut, info
 
-    def _step_game(self, actions: dict[str, Any]) -> StepParts:
-        """Step the environment, and return what it returns as five dicts."""
-        try:
-            result = self._game.step(actions)
-        except Exception as error:
-            add_note(error, f"Raised by the environment's step() {self._where}.")
-            raise
-        if type(result) is tuple and len(result) == 5:
-            obs, rewards, terminations, truncations, infos = result
-            if dict is type(obs) is type(rewards) is type(terminations) is type(truncations) is type(infos):
-                return result
-        return plain_step(result, self._where)
+    def _plain(self, result: Any) -> StepParts:
+        """Convert what a step returned, or find out what is wrong with it."""
+        obs, rewards, terminations, truncations, infos = plain_step(result, self._where)
+        agents = self.possible_agents
+        return (
+            obs,
+            plain_rewards(rewards, self._where),
+            plain_flags("terminations", terminations, agents, self._where),
+            plain_flags("truncations", truncations, agents, self._where),
+            plain_infos(infos, agents, self._where),
+        )
 
     def _own_team_reward(self, rewards: dict[str, float], total: float) -> float:
         """Return the team's reward as the environment computes it."""
