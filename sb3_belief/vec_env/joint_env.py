@@ -133,7 +133,7 @@ class JointEnv(gym.Env):
             raise
         obs, infos = plain_reset(result, self._where)
         separate_agents(self.env)
-        after = [] if self._game.agents is None else list(self._game.agents)
+        after = self._agents_told()
         if not after:
             raise ValueError(f"agents is empty {self._where}: reset() must fill it with the agents that are in play.")
         self._check_possible_agents()
@@ -158,10 +158,10 @@ class JointEnv(gym.Env):
         except Exception as error:
             add_note(error, f"Raised by the environment's step() {self._where}.")
             raise
-        after = list(self._game.agents)
         agents = self.possible_agents
         # Here and below, a cheap look decides whether something has to be converted, or the cause of a fault found
         try:
+            after = list(self._game.agents)
             obs, rewards, terminations, truncations, infos = result
             any_info = any(infos.values())
             any_end = True in terminations.values() or True in truncations.values()
@@ -173,6 +173,7 @@ class JointEnv(gym.Env):
         if type(total) not in _NUMBERS:
             any_info = any_end = True
             as_usual = False
+            after = self._agents_told()
             obs, rewards, terminations, truncations, infos = self._plain(result)
             agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
             total = sum(agent_rewards)
@@ -214,6 +215,11 @@ class JointEnv(gym.Env):
             observations.update({agent: self._zero_obs[agent] for agent in left})
         cut = done and bool(flags.truncated.any())
         return observations, team_reward, done and not cut, cut, info
+
+    def _agents_told(self) -> list[str]:
+        """Return the agents in play, also where the environment has None for nobody."""
+        told = getattr(self._game, "agents", None)
+        return [] if told is None else list(told)
 
     def _plain(self, result: Any) -> StepParts:
         """Convert what a step returned, or find out what is wrong with it."""
@@ -260,7 +266,7 @@ class JointEnv(gym.Env):
     @property
     def agents_in_play(self) -> list[str]:
         """Names of the agents that are in play."""
-        return list(self._game.agents)
+        return self._agents_told()
 
     def close(self) -> None:
         """Close the environment."""

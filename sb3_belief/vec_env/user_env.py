@@ -106,7 +106,7 @@ class UserEnv(ParallelEnv):
     @property
     def agents(self) -> list[str]:
         """Names of the agents in play."""
-        agents = self.env.agents
+        agents = getattr(self.env, "agents", None)
         return [] if agents is None else [self._names.get(name, str(name)) for name in agents]
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> Any:

@@ -170,8 +170,12 @@ def test_a_reset_that_brings_nobody_into_play():
             self.agents = []
             return result
 
-    with pytest.raises(ValueError, match=r"agents is empty in environment copy 0 at reset: reset\(\) must fill it"):
-        make_team_env(Empty).reset()
+    class Without(Duck):
+        agents = property(lambda self: self.nobody)
+
+    for kind in (Empty, Without):
+        with pytest.raises(ValueError, match=r"agents is empty in environment copy 0 at reset: reset\(\) must fill it"):
+            make_team_env(kind).reset()
 
 
 @pytest.mark.parametrize("at_reset", [True, False])

@@ -111,6 +111,13 @@ class Arrays(Views):
     kind = staticmethod(lambda agents: np.array(list(agents), dtype=str))
 
 
+class NoneForNobody(Walkers):
+    def step(self, actions):
+        result = super().step(actions)
+        self.agents = self.agents or None
+        return result
+
+
 class NoOptions(Walkers):
     def reset(self, seed=None):  # type: ignore[override]
         return super().reset()
@@ -185,6 +192,7 @@ CLEAR = [
     Tuples,
     Sets,
     Arrays,
+    NoneForNobody,
     NoOptions,
     Positional,
     SpacesAfterReset,
