@@ -45,7 +45,8 @@ def plain_step(result: Any, where: str) -> StepParts:
     :return: Observations, rewards, terminations, truncations and infos, dicts by agent
     :raises ValueError: If there are other parts, or one of them is no dict
     """
-    if not isinstance(result, (tuple, list)) or len(result) not in (4, 5):
+    # Four parts without infos are not the old ones
+    if not isinstance(result, (tuple, list)) or len(result) not in (4, 5) or (len(result) == 4 and not _are_infos(result[3])):
         raise ValueError(
             f"step() returned {_described(result)} {where}: it must return five dicts by agent, ({', '.join(_PARTS)})."
         )
@@ -134,6 +135,12 @@ def plain_infos(infos: Mapping[str, Any], agents: Iterable[str], where: str) -> 
                 raise ValueError(f"The info of {agent!r} {where} is {_described(info)}: an agent's info is a dict.")
             plain[agent] = dict(info)
     return plain
+
+
+def _are_infos(part: Any) -> bool:
+    return part is None or (
+        isinstance(part, Mapping) and all(info is None or isinstance(info, Mapping) for info in part.values())
+    )
 
 
 def _as_dict(name: str, part: Any, where: str) -> dict[str, Any]:

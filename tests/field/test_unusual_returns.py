@@ -113,6 +113,10 @@ FAULTS: dict[str, tuple[Any, str]] = {
     "no observations": (lambda o, *x: (None, *x), f"The environment's observations {WHERE} are None"),
     "list": (lambda o, *x: (list(o.values()), *x), f"The environment's observations {WHERE} are a list of 2"),
     "three parts": (lambda *x: x[:3], f"step() returned a tuple of 3 {WHERE}"),
+    "no infos": (
+        lambda o, r, te, tr, i: (o, r, te, dict.fromkeys(tr, True)),
+        f"step() returned a tuple of 4 {WHERE}",
+    ),
     "nothing": (lambda *x: None, f"step() returned None {WHERE}"),
     "info": (lambda *x: (*x[:4], {"walker_1": [3]}), f"The info of 'walker_1' {WHERE} is a list of 1"),
     "flags": (
