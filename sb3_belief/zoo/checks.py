@@ -14,7 +14,7 @@ from typing import Any
 
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_belief.zoo.errors import ConfigError, unknown_setting
+from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import resolve
 
 
@@ -39,6 +39,11 @@ class Location:
         """
         return Location(f"{self.text}: {name}", self.extra_packages)
 
+    @property
+    def parent(self) -> str:
+        """Text of the location that this setting lies in."""
+        return self.text.rpartition(": ")[0]
+
 
 class _Mismatch(Exception):
     """Raised if a value does not have a type. If the type is part of a union, the value may still have another one."""
@@ -49,6 +54,7 @@ def accepted_arguments(function: Callable[..., Any]) -> tuple[dict[str, Any], bo
     Return the arguments of a function or of a class's constructor.
 
     A constructor with ``**kwargs`` is assumed to pass them to its base class, so the arguments of the base class count too.
+    Where no base class takes them, the constructor reads them itself, and no signature names them.
 
     :param function: Class or function
     :return: {argument: annotation} in order, and whether there may be further arguments that no signature names
@@ -59,7 +65,7 @@ def accepted_arguments(function: Callable[..., Any]) -> tuple[dict[str, Any], bo
     found: dict[str, Any] = {}
     for constructor in constructors:
         if constructor is object.__init__:
-            return found, False
+            return found, constructor is not constructors[0]
         hints = _hints(constructor)
         signature = inspect.signature(constructor)
         for name, parameter in signature.parameters.items():
@@ -80,7 +86,12 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def check_call(
-    function: Callable[..., Any], given: Any, location: Location, skip: int = 0, reserved: Mapping[str, str] | None = None
+    function: Callable[..., Any],
+    given: Any,
+    location: Location,
+    skip: int = 0,
+    reserved: Mapping[str, str] | None = None,
+    complete: bool = False,
 ) -> dict[str, Any]:
     """
     Check keyword arguments against the signature of the function that takes them.
@@ -90,14 +101,15 @@ def check_call(
     :param location: Where they are given
     :param skip: Number of leading arguments that the caller passes itself
     :param reserved: {argument: what to do instead} for arguments that must not be given here
+    :param complete: Whether these are all of the arguments, so that none without a default may be missing
     :return: The arguments as the function takes them: classes in place of dotted paths, and schedules in place of strings
         such as ``"lin_3e-4"``
-    :raises ConfigError: For an unknown argument or a wrong type
+    :raises ConfigError: For an unknown argument, a wrong type or a missing argument
     """
     if given is None:
         given = {}
     if not isinstance(given, dict):
-        raise ConfigError(f"{location.text}: must be a mapping of arguments, not {given!r}.")
+        raise ConfigError(f"{location.text}: must be a mapping of arguments, not {short(given)}.")
     known, open_ended = accepted_arguments(function)
     reserved = reserved or {}
     allowed = {name: hint for name, hint in list(known.items())[skip:] if name not in reserved}
@@ -110,7 +122,21 @@ def check_call(
         if name not in allowed and not open_ended:
             raise unknown_setting(location.text, "key", name, allowed)
         result[name] = check_value(value, allowed.get(name, Any), location.key(name))
+    missing = [name for name in _required(function, skip) if name not in given] if complete else []
+    if missing:
+        raise ConfigError(
+            f"{location.text}: needs {' and '.join(f'{name!r} ({describe(allowed.get(name, Any))})' for name in missing)},"
+            f" as in {{{location.text.rpartition(': ')[2]}: {{{missing[0]}: ...}}}}."
+        )
     return result
+
+
+def _required(function: Callable[..., Any], skip: int) -> list[str]:
+    """Return the arguments without a default, after those that the caller passes itself."""
+    constructor = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    parameters = list(inspect.signature(constructor).parameters.values())[skip + inspect.isclass(function) :]
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return [each.name for each in parameters if each.default is each.empty and each.kind in named]
 
 
 def check_value(value: Any, hint: Any, location: Location) -> Any:
@@ -126,7 +152,7 @@ def check_value(value: Any, hint: Any, location: Location) -> Any:
     try:
         return _convert(value, hint, location)
     except _Mismatch:
-        raise ConfigError(f"{location.text}: must be {describe(hint)}, not {value!r} ({type(value).__name__}).") from None
+        raise ConfigError(f"{location.text}: must be {describe(hint)}, not {short(value)} ({type(value).__name__}).") from None
 
 
 def _convert(value: Any, hint: Any, location: Location) -> Any:
@@ -185,12 +211,16 @@ def _require(value: Any, condition: bool) -> Any:
 
 def _int(value: Any) -> int:
     # In Python a bool is an int, but in a configuration true is not a number. 1e6 is a float in YAML
-    _require(value, isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer())
+    _require(value, isinstance(value, int | float) and not isinstance(value, bool) and value % 1 == 0)
     return int(value)
 
 
 def _float(value: Any) -> float:
-    return float(_require(value, isinstance(value, int | float) and not isinstance(value, bool)))
+    _require(value, isinstance(value, int | float) and not isinstance(value, bool))
+    try:
+        return float(value)
+    except OverflowError:
+        raise _Mismatch from None
 
 
 _SCALARS: dict[Any, Callable[[Any], Any]] = {
@@ -246,6 +276,8 @@ def describe(hint: Any) -> str:
         return "a mapping"
     if inspect.isclass(container) and issubclass(container, Sequence):
         return "a list" + (f" ({', '.join(describe(arg) for arg in args if arg is not Ellipsis)})" if args else "")
+    if hint is Any or isinstance(hint, typing.TypeVar):
+        return "a value"
     return f"left out (a {getattr(hint, '__name__', hint)} object cannot be written in YAML)"
 
 

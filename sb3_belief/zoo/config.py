@@ -7,6 +7,7 @@ the section and the key. Nothing is created before all of them have been checked
 """
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,40 +19,33 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_value
-from sb3_belief.zoo.errors import ConfigError, unknown_setting
-from sb3_belief.zoo.names import Algo, get_algo, get_env, load_env, resolve
+from sb3_belief.zoo.checks import Location
+from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
+from sb3_belief.zoo.names import get_algo, get_env, load_env
+from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
 DEFAULT = "default"
-REPO_CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
-
-#: The settings of the run itself. Every other key is an argument of the algorithm's constructor
-RUN_KEYS: dict[str, Any] = {
-    "n_envs": int,
-    "n_timesteps": int,
-    "policy": str,
-    "policy_kwargs": dict[str, Any],
-    "normalize": bool | dict[str, Any],
-    "env_wrapper": str | list[Any] | dict[str, Any] | None,
-    "visibility": str | dict[str, Any] | None,
-    "env_kwargs": dict[str, Any],
-    "callback": str | list[Any] | dict[str, Any] | None,
-}
 # Settings that override those of a lower layer as a whole. Merging them as mappings would add a second wrapper to the first
 _REPLACED = ("env_wrapper", "visibility", "callback")
+REPO_CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
 
-_FLAGS = {
-    "env": "use the flag --env",
-    "seed": "use the flag --seed",
-    "device": "use the flag --device",
-    "verbose": "use the flag --verbose",
-    "tensorboard_log": "use the flag --tensorboard-log",
-    "_init_setup_model": "it is internal to Stable-Baselines3",
-}
-_POLICY_INTERNAL = dict.fromkeys(
-    ("observation_space", "action_space", "lr_schedule", "others_action_spaces"), "the algorithm sets it"
-)
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """
+    An agent's algorithm and its settings.
+
+    :param algo: Name of the algorithm
+    :param algo_class: Class of the algorithm
+    :param policy: Name of its policy
+    :param algo_kwargs: Constructor arguments of the algorithm
+    """
+
+    algo: str
+    algo_class: type[BaseAlgorithm]
+    policy: str
+    algo_kwargs: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -73,6 +67,9 @@ class RunConfig:
     :param visibility: Argument of ``make_team_env``: the function that ``visibility`` names, or None
     :param callbacks: Callback classes and their arguments
     :param algo_kwargs: Constructor arguments of each agent's algorithm
+    :param eval_env_kwargs: Arguments of the environment of evaluations, which override ``env_kwargs``
+    :param agents: The agents with settings of their own
+    :param origins: Where each setting comes from: the file and its section, or the flag
     """
 
     algo: str
@@ -89,6 +86,45 @@ class RunConfig:
     visibility: Callable[[Any], Any] | None = None
     callbacks: tuple[tuple[type[BaseCallback], dict[str, Any]], ...] = ()
     algo_kwargs: dict[str, Any] = field(default_factory=dict)
+    eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    agents: dict[str, AgentConfig] = field(default_factory=dict)
+    origins: dict[str, str] = field(default_factory=dict)
+
+    def origin(self, message: str = "") -> str:
+        """
+        Return where the settings come from that an error message speaks of.
+
+        :param message: The message
+        :return: The flags, or file and sections, of the settings that it names; of all settings if it names none
+        """
+        # Some names of settings are words of every message ("policy"): these must be quoted, or stand before a value
+        named = [
+            origin
+            for name, origin in self.origins.items()
+            if re.search(rf"\b{re.escape(name)}\b" + ("" if "_" in name else r"(['`\"=:]| is\b)"), message)
+        ]
+        flags = [origin for origin in self.origins.values() if origin.startswith("-")]
+        return ", ".join(dict.fromkeys(named or [self.source, *flags]))
+
+    def agent(self, name: str) -> AgentConfig:
+        """
+        Return the algorithm of an agent with its settings.
+
+        :param name: Name of the agent
+        :return: Its own, or those of all agents
+        """
+        return self.agents.get(name, AgentConfig(self.algo, self.algo_class, self.policy, self.algo_kwargs))
+
+    def check_agents(self, possible_agents: Sequence[str]) -> None:
+        """
+        Check that the agents with settings of their own exist.
+
+        :param possible_agents: Names of the agents of the environment
+        :raises ConfigError: If one does not
+        """
+        for name in self.agents:
+            if name not in possible_agents:
+                raise unknown_setting(f"{self.origins['agent_kwargs']}: agent_kwargs", "agent", name, possible_agents)
 
     def to_yaml(self) -> str:
         """
@@ -107,6 +143,7 @@ def load_config(
     env_kwargs: Sequence[str] = (),
     n_timesteps: int | None = None,
     extra_packages: tuple[str, ...] = (),
+    eval_env_kwargs: Sequence[str] = (),
 ) -> RunConfig:
     """
     Load, merge and check the settings of a run.
@@ -121,6 +158,7 @@ def load_config(
     :param env_kwargs: ``key:value`` pairs of arguments of the environment
     :param n_timesteps: Number of joint steps to train for, or None for the file's
     :param extra_packages: See ``names.resolve``
+    :param eval_env_kwargs: ``key:value`` pairs of arguments of the environment of evaluations, which override ``env_kwargs``
     :return: The configuration
     :raises ConfigError: For a setting that does not fit. The message names its location, what is allowed and the nearest match
     """
@@ -130,35 +168,46 @@ def load_config(
     sections = read_file(path)
     for name in sections:
         if name != DEFAULT:
-            get_env(name, str(path))
+            get_env(name, str(path), extra_packages)
     if not sections.keys() & {env_id, DEFAULT}:
         existing = ", ".join(sections) or "none"
         raise ConfigError(f"{path}: has no section {env_id!r} and no section {DEFAULT!r}; it has {existing}.")
 
-    layers: list[tuple[Location, Any]] = [
-        (Location(f"{path}, section {name}", extra_packages), sections[name]) for name in (DEFAULT, env_id) if name in sections
+    given: list[tuple[str, Any]] = [
+        (f"{path}, section {name}", sections[name]) for name in (DEFAULT, env_id) if name in sections
     ]
-    layers.append((Location("-params", extra_packages), parse_pairs(params, "-params")))
-    layers.append((Location("--env-kwargs", extra_packages), {"env_kwargs": parse_pairs(env_kwargs, "--env-kwargs")}))
+    given.append(("-params", parse_pairs(params, "-params")))
+    for flag, pairs in (("--env-kwargs", env_kwargs), ("--eval-env-kwargs", eval_env_kwargs)):
+        if pairs:
+            given.append((flag, {flag[2:].replace("-", "_"): parse_pairs(pairs, flag)}))
     if n_timesteps is not None:
-        layers.append((Location("--n-timesteps", extra_packages), {"n_timesteps": n_timesteps}))
-
+        given.append(("--n-timesteps", {"n_timesteps": n_timesteps}))
+    layers = [(Location(text, extra_packages), layer or {}) for text, layer in given]
     for location, layer in layers:
-        if layer is not None and not isinstance(layer, dict):
-            raise ConfigError(f"{location.text}: must be a mapping of settings, not {layer!r}.")
-    checker = _LayerChecker(chosen, make_env, len(get_env(env_id, "--env").leading), _policy_name(layers))
+        if not isinstance(layer, dict):
+            raise ConfigError(f"{location.text}: must be a mapping of settings, not {short(layer)}.")
+
+    n_leading, policy = len(get_env(env_id, "--env").leading), _last(layers, "policy")[1]
+    agents = {}
+    for agent, own in _agent_settings(layers).items():
+        own_algo = get_algo(own.get("algo", algo), f"{_last(layers, 'agent_kwargs')[0]}: agent_kwargs: {agent}: algo")
+        agents[agent] = SettingsChecker(own_algo, make_env, n_leading, own.get("policy", policy))
+    checker = SettingsChecker(chosen, make_env, n_leading, policy, agents)
     settings: dict[str, Any] = {}
     checked: dict[str, Any] = {}
+    origins: dict[str, str] = {}
     # The plain data is merged as well, because config.yml is written from it
     for location, layer in layers:
-        checked = _override(checked, checker.check(layer or {}, location))
-        settings = _override(settings, layer or {})
-    if not settings["env_kwargs"]:
-        del settings["env_kwargs"]
+        checked = _override(checked, checker.check(layer, location))
+        settings = _override(settings, layer)
+        for name, value in layer.items():
+            origins.update(dict.fromkeys([name, *(map(str, value) if isinstance(value, dict) else ())], location.text))
     for key in ("policy", "n_timesteps"):
         if key not in checked:
             raise ConfigError(f"{path}: no {key!r} for {env_id!r}: add it to the section {env_id!r} or {DEFAULT!r}.")
-    return _to_run_config(algo, env_id, settings, str(path), checker.algo_class, {**checked, **chosen.fixed})
+    config = _to_run_config(algo, env_id, settings, str(path), checker.algo_class, {**checked, **chosen.fixed}, origins)
+    _check_episodic(config)
+    return config
 
 
 def find_config_file(algo: str, conf_file: str | None = None) -> Path:
@@ -191,93 +240,35 @@ def find_config_file(algo: str, conf_file: str | None = None) -> Path:
     raise ConfigError(f"No {algo}.yml in {REPO_CONFIGS} nor beside the installed package: name a file with --conf-file.")
 
 
-def _policy_name(layers: Sequence[tuple[Location, Any]]) -> Any:
-    given = [layer["policy"] for _, layer in layers if layer and "policy" in layer]
-    return given[-1] if given else None
+def _last(layers: Sequence[tuple[Location, dict[str, Any]]], key: str) -> tuple[str, Any]:
+    """Return the source that decides a setting, and its value there. An empty text and None if no source has it."""
+    found = [(location.text, layer[key]) for location, layer in layers if key in layer]
+    return found[-1] if found else ("", None)
+
+
+def _agent_settings(layers: Sequence[tuple[Location, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """Return the merged settings of single agents, as far as they have the form of settings at all."""
+    merged: dict[str, Any] = {}
+    for _, layer in layers:
+        own = layer.get("agent_kwargs")
+        if isinstance(own, dict):
+            merged = merge(merged, {agent: each for agent, each in own.items() if isinstance(each, dict)})
+    return merged
+
+
+def _check_episodic(config: RunConfig) -> None:
+    # SB3 checks this by an assertion in the first rollout
+    for kwargs in (config.algo_kwargs, *(agent.algo_kwargs for agent in config.agents.values())):
+        train_freq = kwargs.get("train_freq")
+        if isinstance(train_freq, tuple) and train_freq[1] == "episode" and config.n_envs > 1:
+            raise ConfigError(
+                f"{config.origin('train_freq')}: train_freq: {list(train_freq)} counts episodes, which needs n_envs: 1, not"
+                f" {config.n_envs}. Count steps: train_freq: 4."
+            )
 
 
 def _override(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merge({key: value for key, value in base.items() if not (key in _REPLACED and key in over)}, over)
-
-
-class _LayerChecker:
-    """
-    Checker of one source of settings at a time, for a given algorithm and environment.
-
-    :param algo: The algorithm
-    :param make_env: Callable that makes the environment
-    :param n_leading: Number of its leading arguments that the environment's id determines
-    :param policy: Name of the policy after merging. ``policy_kwargs`` are checked against its arguments
-    """
-
-    def __init__(self, algo: Algo, make_env: Callable[..., Any], n_leading: int, policy: Any) -> None:
-        self.algo_class = algo.load()
-        self.make_env, self.n_leading = make_env, n_leading
-        self.policies = self.algo_class.policy_aliases
-        self.policy_class = self.policies.get(policy) if isinstance(policy, str) else None
-        arguments, _ = accepted_arguments(self.algo_class)
-        fixed = {name: f"the algorithm's name stands for {name}={value!r}" for name, value in algo.fixed.items()}
-        self.reserved = {**_FLAGS, **fixed}
-        self.arguments = {name: hint for name, hint in arguments.items() if name not in (*RUN_KEYS, *self.reserved)}
-        # The algorithm passes some of its arguments to its policy. They can only be set as the algorithm's
-        self.policy_reserved = {**_POLICY_INTERNAL, **dict.fromkeys(arguments, "set it beside policy_kwargs, not inside")}
-
-    def check(self, layer: dict[str, Any], location: Location) -> dict[str, Any]:
-        """
-        Check one source of settings.
-
-        :param layer: Settings as plain data
-        :param location: Where they are given
-        :return: The settings with wrappers, callbacks, classes and schedules in place of their names
-        :raises ConfigError: For a setting that does not fit
-        """
-        checked = {}
-        allowed = [*RUN_KEYS, *self.arguments]
-        for key, value in layer.items():
-            if key in self.reserved:
-                why = f"{key!r} cannot be set here: {self.reserved[key]}"
-                raise ConfigError(f"{location.text}: {why}. Allowed: {', '.join(allowed)}.")
-            if key in RUN_KEYS:
-                checked[key] = self._check_run_key(key, value, location.key(key))
-            elif key in self.arguments:
-                checked[key] = check_value(value, self.arguments[key], location.key(key))
-            else:
-                raise unknown_setting(location.text, "key", key, allowed)
-        return checked
-
-    def _check_run_key(self, key: str, value: Any, location: Location) -> Any:
-        value = check_value(value, RUN_KEYS[key], location)
-        if key in ("n_envs", "n_timesteps") and value < 1:
-            raise ConfigError(f"{location.text}: must be at least 1, not {value}.")
-        if key == "policy" and value not in self.policies:
-            raise unknown_setting(location.text, "policy", value, self.policies)
-        if key == "policy_kwargs" and self.policy_class is not None:
-            return check_call(self.policy_class, value, location, reserved=self.policy_reserved)
-        if key == "env_kwargs":
-            return check_call(self.make_env, value, location, skip=self.n_leading)
-        if key == "env_wrapper":
-            return tuple(self._check_calls(value, location, skip=1))
-        if key == "visibility":
-            calls = self._check_calls(value, location, skip=1)
-            if len(calls) > 1:
-                raise ConfigError(f"{location.text}: must name one function, not {len(calls)}: there is one visibility.")
-            return partial(calls[0][0], **calls[0][1]) if calls else None
-        if key == "callback":
-            callbacks = tuple(self._check_calls(value, location))
-            for callback, _ in callbacks:
-                if not (isinstance(callback, type) and issubclass(callback, BaseCallback)):
-                    raise ConfigError(f"{location.text}: {callback.__name__} is not a callback of Stable-Baselines3.")
-            return callbacks
-        return value
-
-    def _check_calls(self, value: Any, location: Location, skip: int = 0) -> list[tuple[Callable[..., Any], dict[str, Any]]]:
-        """Read what may be a ``path``, a mapping ``{path: arguments, ...}``, or a list of these."""
-        calls = []
-        for item in value if isinstance(value, list) else [] if value is None else [value]:
-            for path, arguments in item.items() if isinstance(item, dict) else [(item, None)]:
-                function = resolve(path, location.text, location.extra_packages)
-                calls.append((function, check_call(function, arguments, location.key(path), skip=skip)))
-        return calls
 
 
 def _wrap(env: Any, wrappers: Sequence[tuple[Callable[..., Any], dict[str, Any]]]) -> Any:
@@ -287,7 +278,13 @@ def _wrap(env: Any, wrappers: Sequence[tuple[Callable[..., Any], dict[str, Any]]
 
 
 def _to_run_config(
-    algo: str, env_id: str, settings: dict[str, Any], source: str, algo_class: type[BaseAlgorithm], checked: dict[str, Any]
+    algo: str,
+    env_id: str,
+    settings: dict[str, Any],
+    source: str,
+    algo_class: type[BaseAlgorithm],
+    checked: dict[str, Any],
+    origins: dict[str, str],
 ) -> RunConfig:
     wrappers = checked.get("env_wrapper", ())
     algo_kwargs = {key: value for key, value in checked.items() if key not in RUN_KEYS}
@@ -308,4 +305,27 @@ def _to_run_config(
         visibility=checked.get("visibility"),
         callbacks=checked.get("callback", ()),
         algo_kwargs=algo_kwargs,
+        eval_env_kwargs=checked.get("eval_env_kwargs", {}),
+        agents={
+            agent: _agent_config(agent, own, AgentConfig(algo, algo_class, checked["policy"], algo_kwargs), origins)
+            for agent, own in checked.get("agent_kwargs", {}).items()
+        },
+        origins=origins,
     )
+
+
+def _agent_config(agent: str, own: dict[str, Any], common: AgentConfig, origins: dict[str, str]) -> AgentConfig:
+    name = own.get("algo", common.algo)
+    kwargs = {key: value for key, value in own.items() if key not in ("algo", "policy")}
+    if name == common.algo:
+        return AgentConfig(name, common.algo_class, own.get("policy", common.policy), merge(common.algo_kwargs, kwargs))
+    # The settings of all agents are arguments of another algorithm, so this agent has none but its own
+    algo = get_algo(name)
+    algo_class, policy = algo.load(), own.get("policy", common.policy)
+    if policy not in algo_class.policy_aliases:
+        where = f"{origins['agent_kwargs']}: agent_kwargs: {agent}"
+        raise ConfigError(
+            f"{where}: {name} has no {policy!r}: give this agent a policy of its own. Allowed:"
+            f" {', '.join(algo_class.policy_aliases)}."
+        )
+    return AgentConfig(name, algo_class, policy, {**kwargs, **algo.fixed})

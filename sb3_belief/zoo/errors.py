@@ -1,8 +1,12 @@
 """The error for settings that do not fit."""
 
+import re
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
 
-from sb3_belief.envs.suites import nearest
+# A list in a message that is longer than this is shortened: the bounds of a large space would hide the rest of the message
+_LONG = 60
 
 
 class ConfigError(ValueError):
@@ -13,6 +17,52 @@ class ConfigError(ValueError):
     """
 
 
+def shorten(text: str) -> str:
+    """
+    Shorten the long lists of numbers in a message, such as the bounds of a space.
+
+    :param text: The message
+    :return: The message with the middle of each long bracketed list left out
+    """
+    return re.sub(rf"\[[-+\d.,\s\[\]aefin]{{{_LONG},}}\]", lambda match: _ends(match[0]), text)
+
+
+def _ends(numbers: str) -> str:
+    words = numbers.replace("\n", " ").split()
+    return f"{' '.join(words[:2])} ... {' '.join(words[-2:])}"
+
+
+def short(value: object) -> str:
+    """
+    Return a value as text for a message.
+
+    :param value: What the user gave
+    :return: Its representation, cut off if it is long
+    """
+    try:
+        text = repr(value)
+    except ValueError:
+        # Python refuses to write out an integer of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 2 * _LONG else f"{text[: 2 * _LONG]}..."
+
+
+def cause(error: BaseException) -> str:
+    """
+    Return the cause of a failure in words: the message of an error and, for errors that are not meant for users, its type and
+    the place where it was raised.
+
+    :param error: The error
+    :return: One line
+    """
+    text = shorten(" ".join(str(error).split()))
+    if isinstance(error, ValueError) and text:
+        return text
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text}{place}" if text else f"{type(error).__name__}{place}"
+
+
 def suggestion(given: object, allowed: Iterable[str]) -> str:
     """
     Return a suggestion for a misspelt setting, to be appended to an error message.
@@ -21,6 +71,9 @@ def suggestion(given: object, allowed: Iterable[str]) -> str:
     :param allowed: The names that are allowed
     :return: `` Did you mean 'x'?`` with the leading space, or an empty string if no name is similar enough
     """
+    # Imported here, so that --help need not import the environments
+    from sb3_belief.envs.suites import nearest
+
     return nearest(given, allowed, most=2, cutoff=0.5)
 
 
@@ -35,4 +88,6 @@ def unknown_setting(where: str, kind: str, given: object, allowed: Iterable[str]
     :return: The error to raise
     """
     names = list(allowed)
-    return ConfigError(f"{where}: unknown {kind} {given!r}.{suggestion(given, names)} Allowed: {', '.join(names) or 'none'}.")
+    return ConfigError(
+        f"{where}: unknown {kind} {short(given)}.{suggestion(given, names)} Allowed: {', '.join(names) or 'none'}."
+    )

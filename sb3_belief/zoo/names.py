@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
 from sb3_belief.envs.suites import SUITES
-from sb3_belief.zoo.errors import ConfigError, suggestion, unknown_setting
+from sb3_belief.zoo.errors import ConfigError, cause, short, suggestion, unknown_setting
 
 #: The packages, or parts of packages, into which a dotted path in a YAML file may point
 ALLOWED_PACKAGES = (
@@ -73,16 +73,17 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
 )
 
 
-def get_algo(name: str) -> Algo:
+def get_algo(name: str, where: str = "--algo") -> Algo:
     """
     Return the algorithm that a short name stands for.
 
     :param name: A key of ``ALGOS``
+    :param where: File, section and key, or flag, for the error message
     :return: The algorithm
     :raises ConfigError: For another name
     """
-    if name not in ALGOS:
-        raise unknown_setting("--algo", "algorithm", name, ALGOS)
+    if not isinstance(name, str) or name not in ALGOS:
+        raise unknown_setting(where, "algorithm", name, ALGOS)
     return ALGOS[name]
 
 
@@ -107,7 +108,7 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     packages = (*ALLOWED_PACKAGES, *extra_packages)
     module_name, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
     if not module_name or not all(part.isidentifier() for part in path.split(".")):
-        raise ConfigError(f"{where}: {path!r} is not a dotted path such as 'supersuit.frame_stack_v1'.")
+        raise ConfigError(f"{where}: {short(path)} is not a dotted path such as 'supersuit.frame_stack_v1'.")
     allowed = f"Allowed: what {', '.join(packages)} define (more packages: the flag --allow-package NAME)."
     if not _is_allowed(module_name, packages):
         root = path.split(".")[0]
@@ -116,6 +117,8 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigError(f"{where}: no module {module_name!r} for {path!r} ({error}). {allowed}") from None
+    except Exception as error:
+        raise ConfigError(f"{where}: the module {module_name!r} fails when it is imported: {cause(error)}.") from error
     try:
         # supersuit raises ImportError for an old version of a wrapper. Its message names the new one
         found = getattr(module, name)
@@ -128,15 +131,21 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     return found
 
 
-def get_env(env_id: str, where: str) -> EnvSpec:
+def get_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> EnvSpec:
     """
     Return the specification of an environment, without importing its package.
 
     :param env_id: Registered id, ``suite/name`` or ``module:callable``
     :param where: File and section, or flag, for the error message
+    :param extra_packages: See ``resolve``. They are imported if the id is unknown without them, because they may register it
     :return: The specification
     :raises ConfigError: For an unknown id
     """
+    try:
+        return spec(env_id)
+    except ValueError:
+        for package in extra_packages:
+            _import_extra(package)
     try:
         return spec(env_id)
     except ValueError as error:
@@ -145,6 +154,15 @@ def get_env(env_id: str, where: str) -> EnvSpec:
             raise ConfigError(f"{where}: {error}") from None
         kinds = [*registered_ids(), *(f"{suite}/<name>" for suite in SUITES), "<module>:<callable>"]
         raise unknown_setting(where, "environment", env_id, kinds) from None
+
+
+def _import_extra(package: str) -> None:
+    try:
+        importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"--allow-package: there is no module {package!r} to import ({error}).") from None
+    except Exception as error:
+        raise ConfigError(f"--allow-package: {package!r} fails when it is imported: {cause(error)}.") from error
 
 
 def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
@@ -157,7 +175,7 @@ def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> C
     :return: The callable
     :raises ConfigError: For an id that is unknown or not allowed, or whose package is not installed
     """
-    found = get_env(env_id, where)
+    found = get_env(env_id, where, extra_packages)
     # The specification of a "module:callable" holds the id itself. This kind can name any code, so the allow-list applies
     if found.parallel == env_id:
         return resolve(env_id.replace(":", "."), where, extra_packages)
@@ -165,3 +183,5 @@ def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> C
         return found.load()
     except ImportError as error:
         raise ConfigError(f"{where}: {error}") from error
+    except Exception as error:
+        raise ConfigError(f"{where}: {env_id} cannot be imported: {cause(error)}.") from error

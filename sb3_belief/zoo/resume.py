@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_belief.zoo.config import RUN_KEYS, RunConfig, load_config
+from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError, suggestion
 from sb3_belief.zoo.run_folder import find_team, run_of
+from sb3_belief.zoo.settings import RUN_KEYS
 from sb3_belief.zoo.yaml_data import parse_pairs
 
 # Settings of the models, which are saved in the team
-_SAVED = ("policy", "policy_kwargs", "normalize")
+_SAVED = ("policy", "policy_kwargs", "normalize", "agent_kwargs")
 
 
 def resume_config(

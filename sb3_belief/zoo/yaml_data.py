@@ -9,13 +9,33 @@ import yaml
 
 from sb3_belief.zoo.errors import ConfigError
 
+# No configuration comes near. A few aliases of aliases can stand for billions of values
+_MOST_VALUES = 100_000
+
 
 class _DataLoader(yaml.SafeLoader):
     """
     PyYAML's safe loader, with which no tag makes an object.
 
-    In addition it refuses duplicate keys and keys that are not strings, and reads ``3e-4`` as a number.
+    In addition it refuses duplicate keys, keys that are not strings, and the octal and sexagesimal numbers of YAML 1.1
+    (``010`` is 8 there, ``1:30`` is 90), and reads ``3e-4`` as a number.
     """
+
+    def construct_number(self, node: yaml.ScalarNode) -> int | float:
+        """
+        Return a number that everyone reads alike.
+
+        :param node: Plain scalar that looks like a number
+        :return: The number
+        """
+        text = node.value.lstrip("+-")
+        if ":" in text or re.fullmatch(r"0[0-9_]+", text):
+            meant = "in base 60" if ":" in text else "octal"
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{node.value!r} is {meant} in YAML 1.1: write a decimal number, or quote it", node.start_mark
+            )
+        is_int = node.tag == "tag:yaml.org,2002:int"
+        return self.construct_yaml_int(node) if is_int else self.construct_yaml_float(node)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         # PyYAML keeps the last of two equal keys, so the first one would be lost silently
@@ -32,6 +52,9 @@ class _DataLoader(yaml.SafeLoader):
             seen.add(key)
         return super().construct_mapping(node, deep=deep)
 
+
+for _kind in ("int", "float"):
+    _DataLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _DataLoader.construct_number)
 
 # PyYAML follows YAML 1.1, in which a float in exponent form needs a dot and a sign, so that 3e-4 is a string. Users mean the
 # number, as in YAML 1.2
@@ -50,12 +73,28 @@ def parse(text: str, where: str) -> Any:
     :raises ConfigError: For text that is not plain YAML data
     """
     try:
-        return yaml.load(text, Loader=_DataLoader)
+        data = yaml.load(text, Loader=_DataLoader)
+        _check_size(data)
+        return data
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ConfigError(f"{where}{line}: {error.problem}. Allowed: plain YAML data, each key once.") from None
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"{where}: not readable as YAML: {error}") from None
+    # An explicit tag that does not fit its value (!!bool maybe) raises whatever PyYAML's constructor happens to raise
+    except (yaml.YAMLError, ValueError, OverflowError, AttributeError, KeyError, TypeError) as error:
+        raise ConfigError(f"{where}: not readable as YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ConfigError(f"{where}: nested too deeply. Allowed: plain YAML data, each key once.") from None
+
+
+def _check_size(data: Any) -> None:
+    """Check that data does not grow without end by aliases that repeat each other, or contain themselves."""
+    stack, visited = [data], 0
+    while stack:
+        visited += 1
+        if visited > _MOST_VALUES:
+            raise ValueError(f"it stands for more than {_MOST_VALUES:,} values")
+        value = stack.pop()
+        stack.extend(value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
 
 
 def read_file(path: Path) -> dict[str, Any]:

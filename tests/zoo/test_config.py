@@ -75,7 +75,7 @@ default:
   n_steps: 8
   gamma: 0.9
   policy_kwargs: {{ortho_init: false, net_arch: [8]}}
-  env_wrapper: supersuit.dtype_v0
+  env_wrapper: {{supersuit.dtype_v0: {{dtype: float32}}}}
 {EASY}:
   gamma: 0.8
   policy_kwargs: {{net_arch: [16]}}
@@ -135,7 +135,7 @@ def test_schedules_go_nowhere_else(key):
 )
 def test_values_become_what_the_constructor_wants(algo, pair, value):
     name = pair.partition(":")[0].partition(".")[0]
-    found = load_config(algo, MEDIUM, params=[pair]).algo_kwargs[name]
+    found = load_config(algo, MEDIUM, params=[pair, "n_envs:1"]).algo_kwargs[name]
     assert found == value and type(found) is type(value)
 
 
