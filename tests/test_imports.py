@@ -53,7 +53,8 @@ def upward(graph: dict[str, set[str]]) -> list[str]:
     for module, others in graph.items():
         for other in others:
             above, below = (name.split(".")[1:2] for name in (module, other))
-            if not above:
+            # __init__ and __main__ of the package itself stand above all
+            if above in ([], ["__main__"]):
                 continue
             if not below or (above != below and LEVEL[above[0]] <= LEVEL[below[0]]):
                 found.append(f"{module} -> {other}")

@@ -134,7 +134,11 @@ class AgentModels:
             agents.rngs[agent] = RngState(None if seed is None else agent_seed(seed, k))
             with RngSwitch(agents.rngs[agent]):
                 file = io.BytesIO(saved.models[agent])
-                agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
+                try:
+                    agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
+                except Exception as error:
+                    add_note(error, f"Raised while the saved model of agent {agent!r} was loaded.")
+                    raise
         return agents
 
     def move(self, loop: JointLoop) -> None:

@@ -4,12 +4,29 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 from sb3_belief.zoo.errors import ConfigError
 
 _ALGO, _ENV = "belief_ppo", "traffic-junction-medium"
 _PAIRS = "key:value pairs; values are read as YAML, and a dot in a key stands for a nested one"
+# The largest numbers that make sense; beyond them numpy, torch or the system fail in ways of their own
+_MOST, _MOST_SEED, _MOST_THREADS, _MOST_FPS = 10**15, 2**31 - 1, 1024, 1000
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser that refuses words as the commands refuse settings."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"Refused: {message}. See {self.prog} --help.\n")
+
+
+class _Version(argparse.Action):
+    """Flag that prints the version. It is read from the file only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        parser.exit(0, f"sb3-belief {Path(__file__).parents[1].joinpath('version.txt').read_text().strip()}\n")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -18,13 +35,11 @@ def make_parser() -> argparse.ArgumentParser:
 
     :return: The parser
     """
-    parser = argparse.ArgumentParser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
-    commands = parser.add_subparsers(dest="subcommand", required=True, metavar="train | enjoy | export | envs | demo")
-    _add_train(commands.add_parser("train", help="train a team from a YAML configuration", **_STYLE))
-    _add_enjoy(commands.add_parser("enjoy", help="replay a trained team", **_STYLE))
-    _add_export(commands.add_parser("export", help="write an agent to a file that runs without this package", **_STYLE))
-    _add_envs(commands.add_parser("envs", help="list the environments, or check one", **_STYLE))
-    _add_demo(commands.add_parser("demo", help="train, measure and show a team on Traffic Junction", **_STYLE))
+    parser = _Parser(prog="sb3-belief", description="Teams of independent learners.", allow_abbrev=False)
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    commands = parser.add_subparsers(dest="subcommand", required=True, metavar=" | ".join(COMMANDS), parser_class=_Parser)
+    for name, (text, add, _) in COMMANDS.items():
+        add(commands.add_parser(name, help=text, **_STYLE))
     return parser
 
 
@@ -42,15 +57,40 @@ _STYLE: dict = {"formatter_class": _HelpFormatter, "allow_abbrev": False}
 _LIST: dict = {"nargs": "+", "action": "extend", "default": []}
 
 
+def _number(text: str, least: int, most: int) -> int:
+    try:
+        # 1e6 is a whole number too
+        value = int(text) if text.lstrip("+-").isdecimal() else float(text)
+        if value % 1 == 0 and least <= value <= most:
+            return int(value)
+    # float("nan") % 1 is no number, and Python reads no integer of thousands of digits
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {most:,}, not {text[:40]!r}")
+
+
 def _positive(text: str) -> int:
-    value = int(float(text))
-    if value < 1 or value != float(text):
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not {text}")
-    return value
+    return _number(text, 1, _MOST)
 
 
 def _positive_or_off(text: str) -> int:
     return -1 if text == "-1" else _positive(text)
+
+
+def _seed(text: str) -> int:
+    return _number(text, 0, _MOST_SEED)
+
+
+def _threads(text: str) -> int:
+    return -1 if text == "-1" else _number(text, 1, _MOST_THREADS)
+
+
+def _processes(text: str) -> int:
+    return _number(text, 1, _MOST_THREADS)
+
+
+def _frame_rate(text: str) -> int:
+    return _number(text, 1, _MOST_FPS)
 
 
 def _add_env_options(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +99,8 @@ def _add_env_options(parser: argparse.ArgumentParser) -> None:
         "--allow-package",
         **_LIST,
         metavar="NAME",
-        help="further packages from which dotted paths in the configuration and module:callable may import",
+        help="further packages from which dotted paths in the configuration and module:callable may import; one that registers"
+        " ids is imported for an id that is unknown without it",
     )
 
 
@@ -75,7 +116,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-n", "--n-timesteps", type=_positive, help="number of joint steps, instead of the configuration's")
     parser.add_argument(
-        "--seed", type=int, help="seed of the team and its environments; if left out, one is drawn and recorded"
+        "--seed", type=_seed, nargs="+", help="seed of the team and its environments; if left out, one is drawn and recorded"
     )
     parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
     parser.add_argument("-tb", "--tensorboard-log", help="folder of the TensorBoard logs")
@@ -87,6 +128,9 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--save-freq", type=_positive_or_off, default=-1, help="save every N joint steps; -1 for only at the end"
     )
+    parser.add_argument(
+        "--eval-env-kwargs", **_LIST, metavar="K:V", help="arguments of the environment in evaluations, beside --env-kwargs"
+    )
     parser.add_argument("-params", **_LIST, metavar="K:V", help=f"settings: {_PAIRS}")
     parser.add_argument("-conf", "--conf-file", help="YAML file instead of zoo_configs/<algo>.yml")
     parser.add_argument(
@@ -95,12 +139,10 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         default="dummy",
         help="whether environment copies run in this process, or in a worker process each",
     )
-    parser.add_argument(
-        "--num-threads", type=_positive_or_off, default=1, help="number of torch's threads; -1 for torch's default"
-    )
+    parser.add_argument("--num-threads", type=_threads, default=1, help="number of torch's threads; -1 for torch's default")
     parser.add_argument(
         "--jobs",
-        type=_positive,
+        type=_processes,
         default=1,
         help="number of processes in which agents with on-policy algorithms learn; the result is the same for any number",
     )
@@ -117,7 +159,8 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_enjoy(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", help="folder of a run, or zip of a team in it")
+    parser.add_argument("run", help="folder of a run, or zip of a team")
+    parser.add_argument("--env", help="id of the environment, for the zip of a team that was saved from Python")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--episodes", type=_positive, default=1, help="number of episodes to play")
     length.add_argument("-n", "--n-timesteps", type=_positive, help="number of steps to play instead")
@@ -126,9 +169,11 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
         "--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily (default)"
     )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the environment")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
     parser.add_argument("--output", help=".gif or .mp4 file to write; if left out, a window is opened")
-    parser.add_argument("--fps", type=_positive, help="frames per second of the file; if left out, the environment's own rate")
+    parser.add_argument(
+        "--fps", type=_frame_rate, help="frames per second of the file; if left out, the environment's own rate"
+    )
     _add_common(parser)
 
 
@@ -149,17 +194,22 @@ def _add_envs(parser: argparse.ArgumentParser) -> None:
     check = what.add_parser("check", help="play an environment and report what it lacks for a team", **_STYLE)
     check.add_argument("env", help="id of the environment, or module:callable")
     check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="number of steps to play")
-    check.add_argument("--seed", type=int, default=0, help="seed of the environment")
+    check.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
     _add_env_options(check)
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
-    from sb3_belief.zoo.demo import EPISODES, TIMESTEPS
-
-    parser.add_argument("-n", "--n-timesteps", type=_positive, default=TIMESTEPS, help="number of joint steps to train for")
-    parser.add_argument("--episodes", type=_positive, default=EPISODES, help="number of episodes of each measurement")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the team and its environments")
+    parser.add_argument(
+        "-n", "--n-timesteps", type=_positive, default=DEMO_TIMESTEPS, help="number of joint steps to train for"
+    )
+    parser.add_argument("--episodes", type=_positive, default=DEMO_EPISODES, help="number of episodes of each measurement")
+    parser.add_argument("--seed", type=_seed, default=0, help="seed of the team and its environments")
     parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+
+
+#: Joint steps of the demo, which take less than five minutes on two cores, and episodes of each of its measurements. With the
+#: YAML entry's own number of steps the team learns more
+DEMO_TIMESTEPS, DEMO_EPISODES = 60_000, 512
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -171,8 +221,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     args = make_parser().parse_args(argv)
-    action = {"train": _train, "enjoy": _enjoy, "export": _export, "envs": _envs, "demo": _demo}[args.subcommand]
-    return _run(action, args, ["sb3-belief", *argv])
+    return _run(COMMANDS[args.subcommand][2], args, ["sb3-belief", *argv])
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
@@ -183,7 +232,8 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     :return: Exit status, as of ``main``
     """
     argv = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(prog="train.py", description="Train a team from a YAML configuration.", **_STYLE)
+    parser = _Parser(prog="train.py", description="Train a team from a YAML configuration.", **_STYLE)
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     _add_train(parser)
     return _run(_train, parser.parse_args(argv), ["python", "train.py", *argv])
 
@@ -211,10 +261,17 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
     from sb3_belief.zoo.resume import resume_config
     from sb3_belief.zoo.train import TrainOptions, train
 
+    if args.seed is not None and len(args.seed) > 1:
+        seeds = " ".join(map(str, args.seed))
+        raise ConfigError(
+            f"--seed: a run has one seed, not {len(args.seed)}. For a run each loop over them in the shell:"
+            f" for seed in {seeds}; do sb3-belief train --seed $seed ...; done"
+        )
     settings: dict[str, Any] = {
         "conf_file": args.conf_file,
         "params": args.params,
         "env_kwargs": args.env_kwargs,
+        "eval_env_kwargs": args.eval_env_kwargs,
         "n_timesteps": args.n_timesteps,
         "extra_packages": tuple(args.allow_package),
     }
@@ -223,17 +280,18 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
     else:
         config = resume_config(args.trained_agent, args.algo, args.env, **settings)
     names = (
-        "seed log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
+        "log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
         " vec_env device num_threads jobs progress trained_agent verbose"
     )
-    options = TrainOptions(**{name: getattr(args, name) for name in names.split()}, command=command)
+    seed = None if args.seed is None else args.seed[0]
+    options = TrainOptions(seed=seed, **{name: getattr(args, name) for name in names.split()}, command=command)
     return 0 if train(config, options).finished else 130
 
 
 def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
-    names = "run episodes n_timesteps deterministic seed output fps device"
+    names = "run env episodes n_timesteps deterministic seed output fps device"
     enjoy(
         EnjoyOptions(
             **{name: getattr(args, name) for name in names.split()},
@@ -266,6 +324,15 @@ def _demo(args: argparse.Namespace, command: list[str]) -> int:
 
     return demo(args.n_timesteps, args.episodes, args.seed, args.log_folder, command)
 
+
+#: The commands: what their help says, what adds their flags, and what they do
+COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace, list[str]], int]]] = {
+    "train": ("train a team from a YAML configuration", _add_train, _train),
+    "enjoy": ("replay a trained team", _add_enjoy, _enjoy),
+    "export": ("write an agent to a file that runs without this package", _add_export, _export),
+    "envs": ("list the environments, or check one", _add_envs, _envs),
+    "demo": ("train, measure and show a team on Traffic Junction", _add_demo, _demo),
+}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -220,7 +220,7 @@ def find_config_file(algo: str, conf_file: str | None = None) -> Path:
     :raises ConfigError: If there is none
     """
     if conf_file is not None:
-        if not Path(conf_file).is_file():
+        if not os.path.isfile(conf_file):
             raise ConfigError(f"--conf-file: no file {conf_file!r}.")
         return Path(conf_file)
     candidates = [REPO_CONFIGS / f"{algo}.yml"]

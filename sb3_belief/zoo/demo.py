@@ -22,10 +22,6 @@ from sb3_belief.zoo.evaluate import Outcome, evaluate
 from sb3_belief.zoo.run_folder import TEAM
 from sb3_belief.zoo.train import TrainOptions, make_env, make_team, train
 
-# Number of joint steps that takes less than five minutes on two cores. With the YAML entry's own number the team learns more
-TIMESTEPS = 60_000
-EPISODES = 512
-
 ALGO, ENV_ID = "belief_ppo", "traffic-junction-medium"
 # Seed of episodes that occur neither in the training nor in its evaluations. All policies meet the same traffic
 MEASURE_SEED = 5_000_000

@@ -1,6 +1,7 @@
 """Replay of a trained team, in a window or as a GIF or MP4 file."""
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +11,17 @@ import numpy as np
 
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
-from sb3_belief.zoo.checks import accepted_arguments
-from sb3_belief.zoo.config import RunConfig, load_config
-from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.checks import Location, accepted_arguments, check_call
+from sb3_belief.zoo.config import load_config
+from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.evaluate import Outcome
-from sb3_belief.zoo.run_folder import find_team, run_of
+from sb3_belief.zoo.names import get_env, load_env
+from sb3_belief.zoo.preflight import check_device, check_output
+from sb3_belief.zoo.run_folder import CONFIG, RECORD, find_team, run_of
+from sb3_belief.zoo.yaml_data import parse_pairs
 
+# Least side of a picture in pixels, as far as whole factors allow it
+_SIDE = 480
 VIDEO_FORMATS = (".gif", ".mp4")
 
 
@@ -24,7 +30,8 @@ class EnjoyOptions:
     """
     Options of a replay.
 
-    :param run: Folder of a run, or zip of a team in it
+    :param run: Folder of a run, or zip of a team
+    :param env: Id of the environment, for the zip of a team that is not in the folder of a run. None for that of the run
     :param episodes: Number of episodes to play
     :param n_timesteps: Number of steps to play instead, or None
     :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
@@ -37,6 +44,7 @@ class EnjoyOptions:
     """
 
     run: str
+    env: str | None = None
     episodes: int = 1
     n_timesteps: int | None = None
     deterministic: bool = True
@@ -56,19 +64,23 @@ def enjoy(options: EnjoyOptions) -> Outcome:
     :return: Returns and successes of the finished episodes
     :raises ConfigError: If there is no such team, or it cannot be shown in the way that the options ask for
     """
-    if options.output is not None and Path(options.output).suffix.lower() not in VIDEO_FORMATS:
-        raise ConfigError(f"--output: {options.output!r} must end in {' or '.join(VIDEO_FORMATS)}.")
+    if options.output is not None:
+        if Path(options.output).suffix.lower() not in VIDEO_FORMATS:
+            raise ConfigError(f"--output: {options.output!r} must end in {' or '.join(VIDEO_FORMATS)}.")
+        check_output(options.output, "--output")
+    check_device(options.device)
     path = find_team(options.run, "enjoy")
-    config, frame_rate = _config_of(path, options)
-    env = _make_team_env(config, options)
+    shown = _with_render_mode(_environment_of(path, options), options)
+    with _refusals_as_config_errors(shown):
+        env = make_team_env(shown.env_id, seed=options.seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
     try:
-        team = Team.load(path, env=env, device=options.device)
+        team = _load_team(path, env, options.device)
         # This comes after loading, which seeds the environment as in the training
         env.seed(options.seed)
         frames: list[np.ndarray] | None = None if options.output is None else []
         outcome = _play(team, env, options, frames)
         if options.output is not None and frames:
-            write_video(Path(options.output), frames, options.fps or frame_rate)
+            write_video(Path(options.output), frames, options.fps or shown.frame_rate)
             print(f"Wrote {len(frames)} frames to {options.output}")
     finally:
         env.close()
@@ -97,50 +109,76 @@ def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
         imageio.mimsave(path, frames, fps=fps, macro_block_size=2)  # type: ignore[arg-type]
 
 
-def _config_of(team: Path, options: EnjoyOptions) -> tuple[RunConfig, int]:
+@dataclass(frozen=True)
+class _Shown:
     """
-    Return the configuration for the replay and the environment's frame rate.
+    The environment of a replay.
 
-    :return: Configuration of the run, with a render mode if the environment has images, and frames per second
+    :param env_id: Its id
+    :param env_kwargs: Its arguments
+    :param wrapper: Argument of ``make_team_env``
+    :param frame_rate: Frames per second
     """
+
+    env_id: str
+    env_kwargs: dict[str, Any]
+    wrapper: Callable[[Any], Any] | None
+    frame_rate: int = 10
+
+
+def _environment_of(team: Path, options: EnjoyOptions) -> _Shown:
+    packages = options.extra_packages
+    if options.env is not None:
+        make_env = load_env(options.env, "--env", packages)
+        given, n_leading = parse_pairs(options.env_kwargs, "--env-kwargs"), len(get_env(options.env, "--env").leading)
+        return _Shown(options.env, check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading), None)
     run = run_of(team)
     if run is None:
         raise ConfigError(
-            f"enjoy: {str(team)!r} is not in the folder of a run (no config.yml and run.json), so its environment is unknown."
+            f"enjoy: {str(team)!r} is not in the folder of a run (no {CONFIG} and {RECORD}), so its environment is unknown:"
+            " name it with --env, and its arguments with --env-kwargs."
         )
     algo, env_id, conf_file = run
-    config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=options.extra_packages)
-    render_mode = "human" if options.output is None else "rgb_array"
+    config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=packages)
+    return _Shown(config.env_id, config.env_kwargs, config.wrapper)
+
+
+def _with_render_mode(shown: _Shown, options: EnjoyOptions) -> _Shown:
+    """Add a render mode, if the environment has one for what is asked, and its frame rate."""
     # SB3's vectorised environments do not pass on the metadata, so it is read from a single copy
-    env = _make_single_env(config)
-    arguments, open_ended = accepted_arguments(spec(config.env_id).load())
+    with _refusals_as_config_errors(shown):
+        env = make_parallel_env(shown.env_id, **shown.env_kwargs)
+    arguments, open_ended = accepted_arguments(spec(shown.env_id).load())
     # An environment may render and still be made by a callable that does not take a render mode
-    has_images = render_mode in env.metadata.get("render_modes", []) and (open_ended or "render_mode" in arguments)
-    frame_rate = int(env.metadata.get("render_fps", 10))
+    takes_mode = open_ended or "render_mode" in arguments
+    modes = list(env.metadata.get("render_modes", [])) if takes_mode else []
+    shown = replace(shown, frame_rate=int(env.metadata.get("render_fps", 10)))
     env.close()
-    if has_images:
-        return replace(config, env_kwargs={**config.env_kwargs, "render_mode": render_mode}), frame_rate
+    wanted = "human" if options.output is None else "rgb_array"
+    if wanted in modes:
+        return replace(shown, env_kwargs={**shown.env_kwargs, "render_mode": wanted})
     if options.output is not None:
-        raise ConfigError(f"enjoy: {config.env_id} has no images to write to {options.output!r}; leave out --output.")
-    return config, frame_rate
+        raise ConfigError(f"enjoy: {shown.env_id} has no images to write to {options.output!r}; leave out --output.")
+    instead = " Write a file instead: --output episode.gif" if "rgb_array" in modes else ""
+    print(f"Nothing is shown: {shown.env_id} has no render mode 'human'.{instead}")
+    return shown
 
 
-def _make_single_env(config: RunConfig) -> Any:
-    with _refusals_as_config_errors(config):
-        return make_parallel_env(config.env_id, **config.env_kwargs)
-
-
-def _make_team_env(config: RunConfig, options: EnjoyOptions) -> TeamVecEnv:
-    with _refusals_as_config_errors(config):
-        return make_team_env(config.env_id, seed=options.seed, env_kwargs=config.env_kwargs, wrapper=config.wrapper)
+def _load_team(path: Path, env: TeamVecEnv, device: str) -> Team:
+    try:
+        return Team.load(path, env=env, device=device)
+    # A damaged file makes zipfile, pickle and torch raise whatever they raise
+    except Exception as error:
+        raise ConfigError(f"enjoy: {str(path)!r} cannot be loaded: {cause(error)}") from error
 
 
 @contextmanager
-def _refusals_as_config_errors(config: RunConfig) -> Iterator[None]:
+def _refusals_as_config_errors(shown: _Shown) -> Iterator[None]:
     try:
         yield
-    except (ValueError, TypeError, ImportError) as error:
-        raise ConfigError(f"enjoy: {config.env_id} refuses its settings: {error}") from error
+    # An environment of the user's own may raise anything
+    except Exception as error:
+        raise ConfigError(f"enjoy: {shown.env_id} refuses its settings: {cause(error)}") from error
 
 
 def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.ndarray] | None) -> Outcome:
@@ -151,9 +189,11 @@ def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.nd
     episode_start = np.ones(1, dtype=bool)
     try:
         obs = env.reset()
+        if frames is None:
+            _warn_if_hidden()
         while len(returns) < options.episodes if options.n_timesteps is None else steps < options.n_timesteps:
             if frames is not None:
-                frames.append(np.asarray(env.render(mode="rgb_array")))
+                frames.append(_frame(env))
             actions, state = team.predict(obs, state, episode_start, options.deterministic, action_masks=env.action_masks())
             obs, _, dones, infos = env.step(actions)
             steps += 1
@@ -166,18 +206,42 @@ def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.nd
                 print(f"Episode {len(returns)}: return {returns[-1]:.3f}, {infos[0]['episode']['l']} steps{success}")
     except KeyboardInterrupt:
         print("Interrupted.")
-    except RuntimeError as error:
-        if options.output is not None:
+    except Exception as error:
+        if options.output is not None or not _is_of_window(error):
             raise
-        # pygame raises a RuntimeError where there is no screen
         raise ConfigError(f"enjoy: cannot open a window ({error}). Write a file instead: --output episode.gif") from error
     return Outcome(np.array(returns, dtype=float), np.array(successes, dtype=bool))
+
+
+def _is_of_window(error: Exception) -> bool:
+    # Where there is no screen, pygame raises a RuntimeError, and pyglet errors of its own
+    return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "pyglet"
+
+
+def _frame(env: TeamVecEnv) -> np.ndarray:
+    image = env.render(mode="rgb_array")
+    frame = None if image is None else np.asarray(image)
+    if frame is None or frame.ndim != 3 or frame.shape[2] not in (3, 4):
+        found = type(image).__name__ if frame is None else f"an array of shape {frame.shape}"
+        raise ConfigError(f"enjoy: the environment's render() returned {found}, not an image [height, width, 3].")
+    # Small pictures, such as those of grids with a pixel a cell, are enlarged by a whole number, which keeps their edges
+    factor = max(1, _SIDE // max(frame.shape[:2]))
+    return frame[..., :3].astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def _warn_if_hidden() -> None:
+    """Say so if pygame has opened its window on no screen: SDL then draws in memory, and raises no error."""
+    pygame = sys.modules.get("pygame")
+    if pygame is not None and pygame.display.get_init() and pygame.display.get_driver() in ("offscreen", "dummy"):
+        print("Nothing is shown: there is no display. Write a file instead: --output episode.gif")
 
 
 def _print_summary(outcome: Outcome) -> None:
     if outcome.returns.size == 0:
         print("No episode ended.")
         return
-    print(f"Mean return over {outcome.returns.size} episodes: {outcome.returns.mean():.3f} (std {outcome.returns.std():.3f})")
+    if outcome.returns.size > 1:
+        mean, std = outcome.returns.mean(), outcome.returns.std()
+        print(f"Mean return over {outcome.returns.size} episodes: {mean:.3f} (std {std:.3f})")
     if outcome.success_rate is not None:
         print(f"Success rate: {outcome.success_rate:.3f}")

@@ -55,12 +55,23 @@ def cause(error: BaseException) -> str:
     :param error: The error
     :return: One line
     """
-    text = shorten(" ".join(str(error).split()))
+    # Notes say which agent or environment copy it was
+    text = shorten(" ".join(" ".join([str(error), *getattr(error, "__notes__", [])]).split()))
     if isinstance(error, ValueError) and text:
         return text
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return f"{type(error).__name__}: {text}{place}" if text else f"{type(error).__name__}{place}"
+
+
+def reason_of(error: OSError | ValueError) -> str:
+    """
+    Return why a file or folder cannot be written or read.
+
+    :param error: The error
+    :return: What the system says, without the path, which the message has already
+    """
+    return getattr(error, "strerror", None) or str(error)
 
 
 def suggestion(given: object, allowed: Iterable[str]) -> str:

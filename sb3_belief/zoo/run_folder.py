@@ -6,6 +6,8 @@ import platform
 import re
 import shlex
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.versions import versions
 from sb3_belief.envs.suites import SUITES
-from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short
 
 CONFIG = "config.yml"
 RECORD = "run.json"
@@ -32,6 +34,7 @@ def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) 
     :param algo: Name of the algorithm
     :param env_id: Id of the environment
     :return: The new, empty folder
+    :raises ConfigError: If it cannot be made
     """
     parent, name = Path(log_folder) / algo, folder_name(env_id)
     numbers = [path.name.removeprefix(f"{name}_") for path in parent.glob(f"{name}_*")]
@@ -44,6 +47,10 @@ def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) 
             folder.mkdir(parents=True)
         except FileExistsError:
             continue
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"-f: cannot make the folder {short(str(folder))} ({reason_of(error)}): name one that can be written."
+            ) from None
         return folder
 
 
@@ -75,8 +82,8 @@ class RunRecord:
     """
     The file ``run.json``, which records what ran, with which seed, by which command, and how it ended.
 
-    It is written at the start and at the end of the run. In the record of a run that was killed the status remains
-    ``running``.
+    It is written at the start and at the end of the run, also if the run fails. Only in the record of a run that was killed
+    the status remains ``running``.
 
     :param folder: Folder of the run
     :param command: The words of the command line
@@ -105,6 +112,15 @@ class RunRecord:
         """
         self.content.update(status=status, seconds=round(time.monotonic() - self._start, 1), **content)
         self._write()
+
+    @contextmanager
+    def failures(self) -> Iterator[None]:
+        """Record a failure of the lines in the context, whatever it is, and raise it on."""
+        try:
+            yield
+        except BaseException as error:
+            self.finish("failed", error=cause(error))
+            raise
 
     def _write(self) -> None:
         # A program that reads the record meanwhile gets the old or the new one, never a part, because replacing is atomic
@@ -141,14 +157,35 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
     :raises ConfigError: If there is none
     """
     path = Path(run)
-    if path.is_file():
+    if os.path.isfile(path):
         return path
-    if not path.is_dir():
+    # os.path, because Path.is_dir raises for a name that is too long
+    if not os.path.isdir(path):
         raise ConfigError(f"{flag}: no file or folder {str(path)!r}. Give a run's folder or a saved team's zip.")
     if not (path / TEAM).is_file():
         others = sorted(str(file.relative_to(path)) for file in path.rglob("*.zip"))
         raise ConfigError(f"{flag}: no {TEAM} in {str(path)!r}. Give one of its zips: {', '.join(others) or 'it has none'}.")
     return path / TEAM
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """
+    Read the record of a run.
+
+    :param folder: Folder of the run
+    :return: Its entries
+    :raises ConfigError: If the file cannot be read
+    """
+    path = folder / RECORD
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(
+            f"{path}: is not readable as JSON ({error}). Without it give the team's zip outside of the folder, with --env."
+        ) from None
+    if not isinstance(record, dict):
+        raise ConfigError(f"{path}: must be a mapping, not {type(record).__name__}: it is damaged.")
+    return record
 
 
 def run_of(team: Path) -> tuple[str, str, Path] | None:
@@ -157,10 +194,13 @@ def run_of(team: Path) -> tuple[str, str, Path] | None:
 
     :param team: Zip of a team
     :return: Algorithm, environment id and configuration file of the run, or None if the zip is not in the folder of a run
+    :raises ConfigError: If the record of the run is damaged
     """
     # Checkpoints lie one folder deeper than the final team
     for folder in list(team.resolve().parents)[:2]:
         if (folder / RECORD).is_file() and (folder / CONFIG).is_file():
-            record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+            record = read_record(folder)
+            if not (isinstance(record.get("algo"), str) and isinstance(record.get("env"), str)):
+                raise ConfigError(f"{folder / RECORD}: does not say which 'algo' and 'env' the run had: it is damaged.")
             return record["algo"], record["env"], folder / CONFIG
     return None

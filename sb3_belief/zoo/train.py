@@ -3,7 +3,8 @@
 import sys
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.zoo.config import RunConfig
-from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.errors import ConfigError, cause
+from sb3_belief.zoo.preflight import check_copies, check_device, check_folder, check_memory
 from sb3_belief.zoo.run_folder import (
     CHECKPOINTS,
     CONFIG,
@@ -98,6 +100,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
     :raises ConfigError: If the environment or the algorithm refuses its settings. Nothing has been written in this case
     """
     trained = None if options.trained_agent is None else find_team(options.trained_agent, "--trained-agent")
+    _check_options(config, options)
     seed = int(np.random.SeedSequence().generate_state(1)[0] % 2**31) if options.seed is None else options.seed
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
@@ -105,14 +108,18 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
     with ExitStack() as stack:
         env = make_env(config, config.n_envs, seed, options.vec_env)
         stack.callback(env.close)
+        config.check_agents(env.possible_agents)
+        check_memory(config, env)
         eval_env = None
         if options.eval_freq > 0:
-            eval_env = make_env(config, options.n_eval_envs, seed + EVAL_SEED_OFFSET, "dummy")
+            eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
+            eval_env = make_env(eval_config, options.n_eval_envs, seed + EVAL_SEED_OFFSET, "dummy")
             stack.callback(eval_env.close)
         # The team opens its logs in the folder, so the folder must exist first. It is removed again if the team is refused
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:
             team = make_team(config, options, env, seed, trained, folder)
+            callbacks = _callbacks(team, config, options, folder, eval_env)
         except BaseException:
             remove_run_folder(folder)
             raise
@@ -125,15 +132,29 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             seed=seed,
             source=config.source,
             trained_agent=None if trained is None else str(trained),
+            start_timesteps=team.num_timesteps,
             vec_env=options.vec_env,
             device=str(options.device),
             num_threads=th.get_num_threads(),
             jobs=options.jobs,
         )
-        env.start_monitor(str(folder))
-        if options.verbose:
-            print(f"Run folder: {folder}  (seed {seed})")
-        return _learn(team, config, options, folder, record, _callbacks(team, config, options, folder, eval_env))
+        with record.failures():
+            env.start_monitor(str(folder))
+            if options.verbose:
+                print(f"Run folder: {folder}  (seed {seed})")
+            return _learn(team, config, options, folder, record, callbacks)
+
+
+def _check_options(config: RunConfig, options: TrainOptions) -> None:
+    check_device(options.device)
+    check_folder(Path(options.log_folder, config.algo, folder_name(config.env_id)), "-f")
+    if options.tensorboard_log is not None:
+        if find_spec("tensorboard") is None:
+            raise ConfigError("-tb: TensorBoard's logs need tensorboard: pip install 'sb3-belief[plots]'.")
+        check_folder(Path(options.tensorboard_log, config.algo, folder_name(config.env_id)), "-tb")
+    check_copies(config.n_envs, options.vec_env, config.origin("n_envs"))
+    if options.eval_freq > 0:
+        check_copies(options.n_eval_envs, "dummy", "--n-eval-envs")
 
 
 def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
@@ -157,8 +178,10 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") 
             wrapper=config.wrapper,
             visibility=config.visibility,
         )
-    except (ValueError, TypeError, ImportError) as error:
-        raise ConfigError(f"{config.source}: {config.env_id} refuses its settings: {error}") from error
+    # An environment of the user's own may raise anything, and any settings may be more than the memory holds
+    except Exception as error:
+        reason = cause(error)
+        raise ConfigError(f"{config.origin(reason)}: {config.env_id} refuses its settings: {reason}") from error
 
 
 def make_team(
@@ -189,22 +212,41 @@ def make_team(
         log_dir=None if folder is None else str(folder),
         jobs=options.jobs,
     )
+    if trained is not None:
+        return _load_team(config, trained, env, seed, common)
     try:
-        if trained is not None:
-            return _load_team(config, trained, env, seed, common)
-        return Team(
-            config.algo_class, config.policy, env, seed=seed, normalize=config.normalize, **common, **config.algo_kwargs
-        )
-    # An AssertionError is a refusal too: SB3 checks action spaces and batch sizes by assertions
-    except (ValueError, TypeError, AssertionError) as error:
-        raise ConfigError(f"{config.source}: {config.algo} cannot be set up on {config.env_id}: {error}") from error
+        return Team(*_algorithms(config, env), env, seed=seed, normalize=config.normalize, **common, **_kwargs(config, env))
+    # SB3 checks action spaces and batch sizes by assertions, and torch raises a RuntimeError for what is too large
+    except Exception as error:
+        reason = cause(error)
+        raise ConfigError(f"{config.origin(reason)}: {config.algo} cannot be set up on {config.env_id}: {reason}") from error
+
+
+def _algorithms(config: RunConfig, env: TeamVecEnv) -> tuple[Any, Any]:
+    if not config.agents:
+        return config.algo_class, config.policy
+    agents = {name: config.agent(name) for name in env.possible_agents}
+    return {name: each.algo_class for name, each in agents.items()}, {name: each.policy for name, each in agents.items()}
+
+
+def _kwargs(config: RunConfig, env: TeamVecEnv) -> dict[str, Any]:
+    if not config.agents:
+        return config.algo_kwargs
+    return {"agent_kwargs": {name: config.agent(name).algo_kwargs for name in env.possible_agents}}
 
 
 def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, common: dict[str, Any]) -> Team:
-    team = Team.load(trained, env=env, **common)
+    try:
+        team = Team.load(trained, env=env, **common)
+    # A damaged file makes zipfile, pickle and torch raise whatever they raise
+    except Exception as error:
+        raise ConfigError(f"--trained-agent: {str(trained)!r} cannot be set up on {config.env_id}: {cause(error)}") from error
     for agent, model in team.agents.items():
-        if type(model) is not config.algo_class:
-            raise ValueError(f"{agent!r} in {str(trained)!r} is a {type(model).__name__}, not a {config.algo_class.__name__}")
+        expected = config.agent(agent).algo_class
+        if type(model) is not expected:
+            raise ConfigError(
+                f"--trained-agent: {agent!r} in {str(trained)!r} is a {type(model).__name__}, not a {expected.__name__}."
+            )
     # Loading seeds the environment as in the run before. With this run's own seed it does not repeat the same episodes
     env.seed(seed)
     return team
@@ -213,7 +255,10 @@ def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, com
 def _callbacks(
     team: Team, config: RunConfig, options: TrainOptions, folder: Path, eval_env: TeamVecEnv | None
 ) -> list[BaseCallback]:
-    callbacks: list[BaseCallback] = [callback(**kwargs) for callback, kwargs in config.callbacks]
+    try:
+        callbacks: list[BaseCallback] = [callback(**kwargs) for callback, kwargs in config.callbacks]
+    except Exception as error:
+        raise ConfigError(f"{config.origin('callback:')}: callback: refuses its settings: {cause(error)}") from error
     # SB3's callbacks count their calls. There is one call for each step of all copies, which is n_envs joint steps
     if options.save_freq > 0:
         save_freq = max(options.save_freq // config.n_envs, 1)
@@ -239,7 +284,7 @@ def _learn(
 ) -> TrainResult:
     env = team.get_env()
     assert env is not None
-    status = "failed"
+    status = "finished"
     try:
         team.learn(
             config.n_timesteps,
@@ -248,16 +293,13 @@ def _learn(
             # A team that continues its training continues counting its steps
             reset_num_timesteps=options.trained_agent is None,
         )
-        status = "finished"
     except KeyboardInterrupt:
         status = "interrupted"
     finally:
-        results: dict[str, Any] = {"timesteps": team.num_timesteps}
-        # After a failure the environment may be broken as well, so it is not asked for its versions
-        if status != "failed":
-            team.save(folder / TEAM)
-            results["environment"] = environment_versions(config.env_id, env)
-        record.finish(status, **results)
+        # A run that fails has come so far, too
+        record.content["timesteps"] = team.num_timesteps
+    team.save(folder / TEAM)
+    record.finish(status, environment=environment_versions(config.env_id, env))
     if options.verbose or status == "interrupted":
         print(f"{status.capitalize()} after {team.num_timesteps} joint steps. Saved: {folder / TEAM}")
     return TrainResult(folder, team, status == "finished")

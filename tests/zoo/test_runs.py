@@ -302,13 +302,17 @@ def test_enjoy_opens_a_window(run, monkeypatch):
     assert main(["enjoy", str(run), "-n", "3"]) == 0
 
 
-def test_an_environment_without_pictures_can_be_trained_and_played(tmp_path, capsys):
-    words = ["--env", "convention-redraw", "-n", "40", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
-    assert train_main([*words, "-params", "n_envs:2", "n_steps:10", "batch_size:20", "--env-kwargs", "rollout_steps:10"]) == 0
-    folder = str(tmp_path / "belief_ppo" / "convention-redraw_1")
-    assert main(["enjoy", folder, "--episodes", "2"]) == 0
-    assert capsys.readouterr().out.count("10 steps") == 2
-    assert main(["enjoy", folder, "--output", str(tmp_path / "a.gif")]) == 2
+def test_an_environment_without_pictures_can_be_trained_and_played(tmp_path, monkeypatch, capsys):
+    (tmp_path / "plain_toys.py").write_text("from tests.team.toy_envs import ToyEnv\ndef make():\n    return ToyEnv(2)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    allow = ["--allow-package", "plain_toys", "tests"]
+    words = ["--env", "plain_toys:make", "-n", "40", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1", *allow]
+    assert train_main([*words, "-params", "n_envs:2", "n_steps:10", "batch_size:20"]) == 0
+    folder = str(tmp_path / "belief_ppo" / "plain_toys-make_1")
+    assert main(["enjoy", folder, "--episodes", "2", *allow]) == 0
+    said = capsys.readouterr().out
+    assert said.count("7 steps") == 2 and "Nothing is shown: plain_toys:make has no render mode 'human'." in said
+    assert main(["enjoy", folder, "--output", str(tmp_path / "a.gif"), *allow]) == 2
     assert "no images" in capsys.readouterr().err
 
 

@@ -293,7 +293,26 @@ class ResumableTupleEnv(GymTupleEnv):
 
 
 class DrawnTupleEnv(ResumableTupleEnv):
-    """``ResumableTupleEnv`` whose game draws itself, and ignores the render mode with which it was made."""
+    """
+    ``ResumableTupleEnv`` whose game shows itself in a window, and ignores the render mode with which it was made.
+
+    Its images are drawn here, because the packages draw theirs in a window too, which needs a display.
+
+    :param env: The environment
+    :param name: Name of the environment for messages, for instance its id
+    """
+
+    def __init__(self, env: gym.Env, name: str | None = None):
+        super().__init__(env, name=name)
+        self.metadata["render_modes"] = ["human", "rgb_array"]
+
+    def _draw(self) -> np.ndarray:
+        """
+        Draw the state of the game.
+
+        :return: uint8 [height, width, 3]
+        """
+        raise NotImplementedError
 
     def render(self) -> Any:
         """
@@ -301,7 +320,7 @@ class DrawnTupleEnv(ResumableTupleEnv):
 
         :return: An image with ``render_mode="rgb_array"``. With ``"human"`` a window is opened
         """
-        return self.game.render(mode=self.render_mode or "human")
+        return self._draw() if self.render_mode == "rgb_array" else self.game.render(mode="human")
 
 
 def make_registered(package: str, id: str, known: Sequence[str], **env_kwargs: Any) -> gym.Env:

@@ -7,6 +7,9 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
+from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture
+
+_FOOD = (196, 60, 52)
 
 
 class Foraging(DrawnTupleEnv):
@@ -54,6 +57,14 @@ class Foraging(DrawnTupleEnv):
             others = positions[:viewer] + positions[viewer + 1 :]
             rows.append([0 <= y - top <= 2 * sight and 0 <= x - left <= 2 * sight for y, x in others])
         return np.array(rows, dtype=bool)
+
+    def _draw(self) -> np.ndarray:
+        picture = GridPicture(*self.game.field.shape)
+        for row, column in np.argwhere(self.game.field):
+            picture.square(row, column, _FOOD, str(self.game.field[row, column]), size=0.7)
+        for index, player in enumerate(self.game.players):
+            picture.disc(*player.position, AGENT_COLOURS[index % len(AGENT_COLOURS)], str(player.level))
+        return picture.image()
 
     def _is_success(self) -> bool:
         return not self.game.field.any()

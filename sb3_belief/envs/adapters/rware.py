@@ -7,6 +7,11 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
+from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture
+
+_GOAL, _SHELF, _REQUESTED = (60, 60, 60), (160, 150, 200), (32, 140, 130)
+# Steps (rows, columns) to which a robot looks
+_HEADINGS = {"UP": (-1, 0), "DOWN": (1, 0), "LEFT": (0, -1), "RIGHT": (0, 1)}
 
 
 class Warehouse(DrawnTupleEnv):
@@ -38,6 +43,18 @@ class Warehouse(DrawnTupleEnv):
             for viewer in robots
         ]
         return np.array(rows, dtype=bool)
+
+    def _draw(self) -> np.ndarray:
+        game = self.game
+        picture = GridPicture(*game.grid_size)
+        for x, y in game.goals:
+            picture.square(y, x, _GOAL, "goal")
+        for shelf in game.shelfs:
+            picture.square(shelf.y, shelf.x, _REQUESTED if shelf in game.request_queue else _SHELF, size=0.9)
+        for index, robot in enumerate(game.agents):
+            colour = AGENT_COLOURS[index % len(AGENT_COLOURS)]
+            picture.disc(robot.y, robot.x, colour, "*" if robot.carrying_shelf else "", _HEADINGS[robot.dir.name])
+        return picture.image()
 
     def _is_time_limit(self) -> bool:
         return True

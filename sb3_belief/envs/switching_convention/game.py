@@ -99,6 +99,8 @@ class ConventionGame:
         # Steps since the copy was last seeded. Unlike time it is not reset with an episode, and it determines the convention
         self.age = np.zeros(n_copies, dtype=np.int64)
         self.leader = np.zeros(n_copies, dtype=np.int64)
+        # The actions of the last step, for pictures only
+        self.follower = self.leader
         self.conventions = np.zeros((n_copies, config.m), dtype=np.int64)
         self._copy = np.arange(n_copies)
         self._convention_steps = None if config.K is None else config.K * config.rollout_steps
@@ -140,7 +142,7 @@ class ConventionGame:
         :param actions: Actions of the followers, int [n_copies], each in [0, m)
         :return: Rewards, float32 [n_copies], and whether the episode has ended, bool [n_copies]
         """
-        self.leader = self.conventions[self._copy, self.cue]
+        self.leader, self.follower = self.conventions[self._copy, self.cue], actions
         rewards = (actions == self.leader).astype(np.float32)
         if self.config.rewarded == "last":
             # age // rollout_steps is the number of the rollout, and a convention is valid for K of them

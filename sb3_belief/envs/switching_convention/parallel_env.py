@@ -5,8 +5,9 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_belief.envs.base import TeamGame
+from sb3_belief.envs.base import TeamGame, check_render_mode, require_render_mode
 from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
+from sb3_belief.envs.switching_convention.rendering import draw_convention
 
 FOLLOWER, LEADER = "follower", "leader"
 
@@ -57,11 +58,15 @@ class SwitchingConvention(TeamGame[int, int]):
     :param leader_visible: Whether the follower can observe the leader's actions
     :param seed: Seed of the sequence of conventions, >= 0. All copies made with the same seed have the same leader. The seed
         of ``reset`` determines the cues
+    :param render_mode: None or ``"rgb_array"``
     :raises ValueError: For any other value, and for ``rewarded="last"`` with ``K=None``
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "switching_convention_v0", "render_modes": [], "is_parallelizable": True}
-    render_mode = None
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "switching_convention_v0",
+        "render_modes": ["rgb_array"],
+        "is_parallelizable": True,
+    }
 
     def __init__(
         self,
@@ -71,7 +76,9 @@ class SwitchingConvention(TeamGame[int, int]):
         rewarded: str = "always",
         leader_visible: bool = True,
         seed: int = 0,
+        render_mode: str | None = None,
     ):
+        self.render_mode = check_render_mode(render_mode, ("rgb_array",))
         self.config = ConventionConfig(m, K, rollout_steps, rewarded, leader_visible, seed)
         self.game = ConventionGame(1, self.config)
         self.possible_agents = [FOLLOWER]
@@ -141,6 +148,16 @@ class SwitchingConvention(TeamGame[int, int]):
         :return: {follower: bool [1]}
         """
         return {FOLLOWER: np.array([self.config.leader_visible])}
+
+    def render(self) -> np.ndarray:
+        """
+        Return a picture of the convention, the cue and the last actions.
+
+        :return: uint8 [height, width, 3]
+        :raises ValueError: If the environment was made without a render mode
+        """
+        require_render_mode(self.render_mode, ("rgb_array",))
+        return draw_convention(self.game, 0)
 
     def get_state(self) -> dict[str, Any]:
         """

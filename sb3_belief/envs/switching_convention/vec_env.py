@@ -6,9 +6,11 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_belief.envs.base import check_render_mode
 from sb3_belief.envs.batched_vec_env import BatchedVecEnv
 from sb3_belief.envs.switching_convention.game import ConventionConfig, ConventionGame
 from sb3_belief.envs.switching_convention.parallel_env import FOLLOWER, LEADER
+from sb3_belief.envs.switching_convention.rendering import draw_convention
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 
@@ -21,18 +23,26 @@ class SwitchingConventionVecEnv(BatchedVecEnv):
     afterwards. ``get_attr("convention")`` returns the current convention of each copy.
 
     :param num_envs: Number of environment copies, at least 1
-    :param env_kwargs: The arguments of :class:`SwitchingConvention`
+    :param render_mode: None or ``"rgb_array"``
+    :param env_kwargs: The other arguments of :class:`SwitchingConvention`
     :raises ValueError: For a value that is not allowed
     """
 
-    def __init__(self, num_envs: int, **env_kwargs: Any):
+    def __init__(self, num_envs: int, render_mode: str | None = None, **env_kwargs: Any):
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} must be at least 1.")
         self.config = ConventionConfig(**env_kwargs)
         self.game = ConventionGame(num_envs, self.config)
         numbers = {FOLLOWER: spaces.Discrete(self.config.m)}
         scripted: dict[str, spaces.Space] = {LEADER: spaces.Discrete(self.config.m)}
-        super().__init__(num_envs, [FOLLOWER], numbers, numbers, scripted_action_spaces=scripted)
+        super().__init__(
+            num_envs,
+            [FOLLOWER],
+            numbers,
+            numbers,
+            render_mode=check_render_mode(render_mode, ("rgb_array",)),
+            scripted_action_spaces=scripted,
+        )
         self._one_hot = np.eye(self.config.m, dtype=np.float32)
         # All infos share these arrays, which are therefore read-only
         self._always = {
@@ -75,6 +85,14 @@ class SwitchingConventionVecEnv(BatchedVecEnv):
             cues = self.game.cue
         # The follower is the only agent, so its reward is also the team's. A copy, so that the infos have arrays of their own
         return {FOLLOWER: cues}, rewards.copy(), dones, infos
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """
+        Return a picture of each copy.
+
+        :return: One array per copy, uint8 [height, width, 3]
+        """
+        return [draw_convention(self.game, copy) for copy in range(self.num_envs)]
 
     @property
     def batched_game(self) -> ConventionGame:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.envs.pictures import import_pygame
 from sb3_belief.envs.traffic_junction.core import BRAKE, TrafficCore
 from sb3_belief.envs.traffic_junction.layout import Cell, Layout
 
@@ -35,7 +36,7 @@ class Renderer:
     """
 
     def __init__(self, layout: Layout, max_steps: int):
-        self.pygame = _import_pygame()
+        self.pygame = import_pygame()
         self.pygame.font.init()
         self.layout = layout
         self.max_steps = max_steps
@@ -244,11 +245,3 @@ def _headings(layout: Layout) -> np.ndarray:
             before, after = path[max(k - 1, 0)], path[min(k + 1, len(path) - 1)]
             angles[r * layout.stride + k] = math.degrees(math.atan2(before[0] - after[0], after[1] - before[1]))
     return angles
-
-
-def _import_pygame() -> Any:
-    try:
-        import pygame
-    except ImportError as error:
-        raise ImportError('Rendering needs pygame: pip install "sb3-belief[plots]"') from error
-    return pygame

@@ -137,13 +137,27 @@ def test_observations_and_arguments():
         rware.make(TWO, observation_type="dict")
 
 
-def test_rendering_follows_the_render_mode():
+def test_images_need_no_display():
+    pytest.importorskip("pygame")
     env = rware.make(TWO, render_mode="rgb_array")
     env.reset(seed=0)
+    env.game.render = None  # the package's own, which opens a window
+    pictures = [env.render()]
+    for _ in range(5):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        pictures.append(env.render())
+    assert all(picture.dtype == np.uint8 and picture.shape == pictures[0].shape for picture in pictures)
+    assert pictures[0].shape[2] == 3 and any((picture != pictures[0]).any() for picture in pictures)
+
+
+def test_the_window_is_the_packages_own():
+    env = rware.make(TWO, render_mode="human")
     asked = []
-    env.game.render = lambda mode: asked.append(mode)
+    env.game.render = lambda mode="human": asked.append(mode)
+    env.reset(seed=0)
+    before = len(asked)
     env.render()
-    assert asked == ["rgb_array"]
+    assert asked[before:] == ["human"]
 
 
 @pytest.mark.parametrize("env_kwargs", [{}, {"msg_bits": 1, "reward_type": "global"}])

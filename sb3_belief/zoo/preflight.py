@@ -1,0 +1,179 @@
+"""What is tried before a run writes anything: its folders, its device, and whether its sizes can be."""
+
+import inspect
+import itertools
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_belief.team import TeamVecEnv
+from sb3_belief.zoo.config import AgentConfig, RunConfig
+from sb3_belief.zoo.errors import ConfigError, reason_of, short
+
+_GB = 1e9
+# Least memory of a copy of an environment, in bytes: the objects of one in this process, and a Python with numpy in a worker
+_COPY, _WORKER = 2_000, 30_000_000
+
+
+def check_folder(folder: str | os.PathLike[str], flag: str) -> None:
+    """
+    Check that files can be written in a folder, which is made if necessary and removed again.
+
+    :param folder: Path of the folder
+    :param flag: Flag that it was given to, for the error message
+    :raises ConfigError: If it cannot be made, or not written
+    """
+    try:
+        # Only an attempt tells: permissions are not all that can prevent a file (a full disk, a read-only mount, /proc)
+        with _made(Path(folder)), tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{flag}: cannot write in the folder {short(str(folder))} ({reason_of(error)}): name one that can be written."
+        ) from None
+
+
+def check_output(path: str, flag: str) -> None:
+    """
+    Check that a file can be written.
+
+    :param path: Path of the file, whose folder need not exist yet
+    :param flag: Flag that it was given to, for the error message
+    :raises ConfigError: If it cannot
+    """
+    file = Path(path)
+    try:
+        with _made(file.parent):
+            existed = os.path.exists(path)
+            # For adding: a file that exists keeps its contents
+            with open(path, "ab"):
+                pass
+            if not existed:
+                file.unlink()
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{flag}: cannot write the file {short(path)} ({reason_of(error)}): name one that can be written."
+        ) from None
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder for the lines in the context, with those above it that are missing, and remove what was made."""
+    made: list[Path] = []
+    try:
+        for each in reversed([folder, *folder.parents]):
+            if not each.is_dir():
+                each.mkdir()
+                made.append(each)
+        yield
+    finally:
+        for each in reversed(made):
+            each.rmdir()
+
+
+def check_device(device: str) -> None:
+    """
+    Check that models can be on a device.
+
+    :param device: ``"auto"`` or the name of a device
+    :raises ConfigError: If there is no such device here. Stable-Baselines3 would take the CPU instead of a missing GPU
+    """
+    if device == "auto":
+        return
+    try:
+        th.zeros(1, device=device).sum().item()
+    # torch raises whatever the backend raises
+    except Exception as error:
+        found = [f"cuda:{index}" for index in range(th.cuda.device_count())] if th.cuda.is_available() else []
+        reason = " ".join(str(error).split())[:150]
+        raise ConfigError(
+            f"--device: {device!r} is not available here ({reason}). Allowed: {', '.join(['auto', 'cpu', *found])}."
+        ) from None
+
+
+def check_copies(n_envs: int, vec_env: str, where: str) -> None:
+    """
+    Check that so many copies of an environment can be, before the first of them is made.
+
+    :param n_envs: Number of copies
+    :param vec_env: ``"dummy"`` or ``"subproc"``
+    :param where: Flag, or file and key, for the error message
+    :raises ConfigError: If they need more memory than there is
+    """
+    needed = n_envs * (_WORKER if vec_env == "subproc" else _COPY)
+    if needed > total_memory():
+        kind = "worker processes" if vec_env == "subproc" else "copies of the environment"
+        raise ConfigError(
+            f"{where}: {n_envs:,} {kind} need at least {needed / _GB:,.0f} GB of memory, and this machine has"
+            f" {total_memory() / _GB:,.0f} GB: use fewer."
+        )
+
+
+def check_memory(config: RunConfig, env: TeamVecEnv) -> None:
+    """
+    Check that the models of a team can be, before their memory is allocated.
+
+    :param config: Configuration of the team
+    :param env: Its environment
+    :raises ConfigError: If buffers and networks need more memory than the machine has. The message has the estimate
+    """
+    parts = {
+        agent: _agent_memory(config.agent(agent), config, env.observation_space[agent], env.action_space[agent])
+        for agent in env.possible_agents
+    }
+    needed = sum(sum(part.values()) for part in parts.values())
+    if needed > total_memory():
+        agent, largest = max(parts.items(), key=lambda item: sum(item[1].values()))
+        name = max(largest, key=lambda key: largest[key])
+        raise ConfigError(
+            f"{config.origin(name)}: the models need about {needed / _GB:,.0f} GB of memory, and this machine has"
+            f" {total_memory() / _GB:,.0f} GB. Lower {name!r}, of which {agent} alone needs {largest[name] / _GB:,.1f} GB."
+        )
+
+
+def total_memory() -> float:
+    """
+    Return the machine's memory.
+
+    :return: Bytes; infinite where the system does not say it
+    """
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def _agent_memory(agent: AgentConfig, config: RunConfig, observed: spaces.Space, acted: spaces.Space) -> dict[str, float]:
+    """Estimate the bytes of an agent's buffers and networks from below, by the setting that decides them."""
+    defaults = {name: each.default for name, each in inspect.signature(agent.algo_class).parameters.items()}
+    settings: dict[str, Any] = {**defaults, **agent.algo_kwargs}
+    network = agent.algo_kwargs.get("policy_kwargs") or {}
+    width, action = spaces.flatdim(observed), spaces.flatdim(acted)
+    if "buffer_size" in settings:
+        # The memory of a replay buffer is taken as it fills
+        rows, name = min(settings["buffer_size"], config.n_timesteps), "buffer_size"
+        row = 2 * width * (1 if observed.dtype == np.uint8 else 4) + 4 * action
+    else:
+        rows, name = settings["n_steps"] * config.n_envs, "n_steps"
+        row = 4 * (width + action + 6)
+    memory = {name: float(rows) * row}
+    if "history_length" in settings and settings.get("belief") != "none":
+        memory["history_length"] = 4.0 * settings["history_length"] * (width + action)
+    layers = network.get("net_arch") or []
+    for widths in layers.values() if isinstance(layers, dict) else [layers]:
+        sizes = [width, *(size for size in widths if isinstance(size, int))]
+        # A weight, its gradient, and the two averages of Adam
+        weights = sum(math.prod(pair) for pair in itertools.pairwise(sizes))
+        memory["net_arch"] = memory.get("net_arch", 0.0) + 16.0 * weights
+    for key in ("embedding_dim", "latent_dim", "lstm_hidden_size"):
+        if isinstance(network.get(key), int):
+            memory[key] = 16.0 * network[key] * (network[key] + width)
+    return memory
