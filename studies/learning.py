@@ -7,7 +7,8 @@ Train the full YAML entry of an environment with several beliefs and seeds, and 
 
 prints a row for each run: the joint steps; return and success rate over 1,024 episodes that the training did not use, with
 sampled and then with greedy actions; the CPU seconds of the training; and the run's folder. Belief "none" is IPPO. A run that
-the log folder already has is not trained again, so that a long comparison can be made in pieces. `--plot` draws all runs.
+the log folder already has, with the same settings, episodes and versions of the packages, is not trained again, so that a long
+comparison can be made in pieces. `--plot` draws all runs.
 """
 
 import argparse
@@ -17,17 +18,21 @@ from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 
 from sb3_belief.belief_ppo.options import BELIEFS
+from sb3_belief.common.versions import versions
 from sb3_belief.report.comparison import plot_comparison
 from sb3_belief.report.learning_curve import QUANTITIES
 from sb3_belief.team import Team
 from sb3_belief.zoo.config import RunConfig, load_config
+from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import evaluate
+from sb3_belief.zoo.preflight import check_output
 from sb3_belief.zoo.run_folder import folder_name
-from sb3_belief.zoo.train import TrainOptions, make_env, train
+from sb3_belief.zoo.train import TrainOptions, make_env, make_team, train
 
 # Seed of episodes that neither the training nor its evaluations use
 MEASURE_SEED = 9_000_000
@@ -82,12 +87,13 @@ def learn(
     :return: The result, None if the training was interrupted
     """
     config = load_config(algo, env_id, params=[f"belief:{belief}"], n_timesteps=n_timesteps)
-    # The file also holds the settings: with a changed YAML entry the run is trained again
+    # The file also holds what decides the result: with a changed YAML entry, say, the run is trained again
+    decisive = {"config": config.to_yaml(), "episodes": episodes, "versions": versions()}
     name = f"{algo}-{folder_name(env_id)}-{belief}-{config.n_timesteps}-{seed}"
     path = Path(log_folder, "learning", f"{name}.json")
     if path.is_file():
         record = json.loads(path.read_text(encoding="utf-8"))
-        if record["config"] == config.to_yaml():
+        if {key: record.get(key) for key in decisive} == decisive:
             return Learned(**record["learned"])
     start = time.process_time()
     # No evaluations during the training, since they would count as its time
@@ -98,7 +104,7 @@ def learn(
     sampled, greedy = (_measure(config, result.team, episodes, deterministic) for deterministic in (False, True))
     learned = Learned(belief, seed, result.team.num_timesteps, sampled, greedy, seconds, str(result.folder))
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"config": config.to_yaml(), "learned": asdict(learned)}, indent=2), encoding="utf-8")
+    path.write_text(json.dumps({**decisive, "learned": asdict(learned)}, indent=2), encoding="utf-8")
     return learned
 
 
@@ -107,6 +113,36 @@ def _measure(config: RunConfig, team: Team, episodes: int, deterministic: bool) 
     outcome = evaluate(team, env, episodes, deterministic)
     env.close()
     return float(outcome.returns.mean()), outcome.success_rate, outcome.standard_error
+
+
+def check_plot(path: str, quantity: str, config: RunConfig) -> None:
+    """
+    Check that the runs can be plotted in the end, before any of them is trained.
+
+    :param path: Picture to write
+    :param quantity: What it shows
+    :param config: Configuration of one of the runs
+    :raises ConfigError: If the picture cannot be written, or the environment does not report what it shows
+    """
+    if find_spec("matplotlib") is None:
+        raise ConfigError("--plot: plots need matplotlib: pip install 'sb3-belief[plots]'.")
+    from matplotlib.figure import Figure
+
+    formats = Figure().canvas.get_supported_filetypes()
+    if Path(path).suffix[1:].lower() not in formats:
+        raise ConfigError(f"--plot: {path!r} must end in one of {', '.join(f'.{name}' for name in formats)}.")
+    check_output(path, "--plot")
+    if quantity == "success" and not _reports_success(config):
+        raise ConfigError(f"--quantity: {config.env_id} reports no successes; draw --quantity return.")
+
+
+def _reports_success(config: RunConfig) -> bool:
+    """Play one episode with an untrained team and return whether its end says if it was a success."""
+    env = make_env(config, 1, MEASURE_SEED)
+    try:
+        return evaluate(make_team(config, TrainOptions(verbose=0), env, 0), env, 1).success_rate is not None
+    finally:
+        env.close()
 
 
 def compare(beliefs: Iterable[str], seeds: Iterable[int], jobs: int, **settings: object) -> list[Learned]:
@@ -144,6 +180,11 @@ def main() -> None:
     parser.add_argument("--quantity", default="return", choices=list(QUANTITIES), help="what it shows")
     args = parser.parse_args()
 
+    if args.plot:
+        try:
+            check_plot(args.plot, args.quantity, load_config(args.algo, args.env))
+        except ConfigError as error:
+            parser.error(str(error))
     print(_COLUMNS, flush=True)
     settings = dict(algo=args.algo, env_id=args.env, n_timesteps=args.n_timesteps)
     results = compare(args.beliefs, args.seeds, args.jobs, **settings, episodes=args.episodes, log_folder=args.log_folder)

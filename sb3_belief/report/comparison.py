@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_belief.report.learning_curve import INK, QUANTITIES, new_axes, read_episodes, save_figure
+from sb3_belief.report.learning_curve import INK, check_quantity, new_axes, no_successes, read_episodes, save_figure
 
 COLOURS = ("#1f6f8b", "#c8553d", "#7a8b3c", "#6b5b95", "#b8860b", "#555555")
 
@@ -52,14 +52,13 @@ def plot_comparison(
     :raises ValueError: For another quantity, or if a run has finished no episode, or reports no successes although
         ``quantity`` is ``"success"``
     """
-    if quantity not in QUANTITIES:
-        raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
+    check_quantity(quantity)
     curves = {}
     for name, folders in runs.items():
         curves[name] = [read_episodes(folder) for folder in folders]
         for folder, (_, _, successes) in zip(folders, curves[name], strict=True):
             if quantity == "success" and np.isnan(successes).any():
-                raise ValueError(f"{os.fspath(folder)!r} reports no successes; draw quantity='return'.")
+                raise no_successes(folder)
 
     figure, axes = new_axes(title, quantity)
     edges = np.linspace(0, max(steps[-1] for runs_of in curves.values() for steps, _, _ in runs_of), n_bins + 1)

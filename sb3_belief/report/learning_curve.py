@@ -1,9 +1,12 @@
 """Learning curve of one run."""
 
+import json
+import math
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,18 +19,29 @@ def read_monitor(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     """
     Read the episodes in the team's ``monitor.csv``.
 
+    The last line of a run that was killed, or still runs, may be cut off. It is left out.
+
     :param folder: Folder of a run
     :return: Joint steps after which each episode ended (float ``[k]``, summed over the copies), team returns ``[k]`` and
         successes ``[k]`` (0 or 1, or NaN if the environment does not report them)
     :raises FileNotFoundError: If the run has no monitor file
+    :raises ValueError: If another line than the last one is damaged. The message has its number
     """
+    path = Path(folder) / "monitor.csv"
     # SB3's own reader needs pandas, which is too large a dependency for one file of numbers
-    lines = (Path(folder) / "monitor.csv").read_text(encoding="utf-8").splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    # Even a number that can be read may be the beginning of another one
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
     # The first line is a comment with SB3's metadata
-    names = lines[1].split(",")
-    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines[2:]]
-    lengths = np.array([float(row["l"]) for row in rows])
-    returns = np.array([float(row["r"]) for row in rows])
+    names = lines[1].strip().split(",") if len(lines) > 1 else []
+    rows, lengths, returns = [], np.zeros(max(len(lines) - 2, 0)), np.zeros(max(len(lines) - 2, 0))
+    for index, line in enumerate(lines[2:]):
+        try:
+            rows.append(dict(zip(names, line.strip().split(","), strict=True)))
+            lengths[index], returns[index] = float(rows[-1]["l"]), float(rows[-1]["r"])
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{path}, line {index + 3}: {line.strip()!r} is not an episode: the file is damaged.") from error
     numbers = {"True": 1.0, "False": 0.0}
     successes = np.array([numbers.get(row.get("is_success", ""), np.nan) for row in rows])
     return np.cumsum(lengths), returns, successes
@@ -40,14 +54,55 @@ def read_evaluations(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.nda
     :param folder: Folder of a run
     :return: Joint steps ``[k]``, mean returns ``[k]`` and success rates ``[k]`` (NaN if the environment does not report
         them) of the team when it acts greedily. None if it was never evaluated
+    :raises ValueError: If the file is damaged
     """
     path = Path(folder) / "evaluations.npz"
     if not path.is_file():
         return None
-    with np.load(path) as data:
-        returns = data["results"].mean(axis=1)
-        successes = data["successes"].mean(axis=1) if "successes" in data else np.full(len(returns), np.nan)
-        return data["timesteps"].astype(float), returns, successes
+    try:
+        with np.load(path) as data:
+            returns = data["results"].mean(axis=1)
+            successes = data["successes"].mean(axis=1) if "successes" in data else np.full(len(returns), np.nan)
+            return data["timesteps"].astype(float), returns, successes
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: is damaged ({error}): remove it to draw the curve without evaluations.") from error
+
+
+class Part(NamedTuple):
+    """
+    Part of a training that was continued.
+
+    :param folder: Folder of the run
+    :param start: Joint step at which it starts
+    :param end: Joint step at which the next run continues it, infinite for the last one
+    """
+
+    folder: Path
+    start: float
+    end: float
+
+
+def parts_of(folder: str | os.PathLike[str]) -> list[Part]:
+    """
+    Return the runs whose training a run continues, and the run itself.
+
+    :param folder: Folder of a run
+    :return: The runs, from the first one on. Those that are no longer where they were are left out
+    """
+    parts: list[Part] = []
+    path: Path | None = Path(folder)
+    while path is not None and path not in [part.folder for part in parts]:
+        try:
+            record = json.loads((path / "run.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            # A curve needs no record: without one, the run is taken for one that continues nothing
+            record = {}
+        start, trained = float(record.get("start_timesteps") or 0), record.get("trained_agent")
+        parts.insert(0, Part(path, start, parts[0].start if parts else math.inf))
+        # A checkpoint lies one folder deeper than the final team
+        above = list(Path(trained).parents)[:2] if start and trained else []
+        path = next((each for each in above if (each / "monitor.csv").is_file()), None)
+    return parts
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
@@ -66,17 +121,44 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Read the episodes of a run and check that there are any.
+    Read the episodes of a run, and of the runs that it continues, and check that there are any.
 
     :param folder: Folder of a run
-    :return: The arrays that ``read_monitor`` returns
+    :return: The arrays that ``read_monitor`` returns, for all of these runs on one axis of joint steps
     :raises FileNotFoundError: If the run has no monitor file
-    :raises ValueError: If the run has finished no episode
+    :raises ValueError: If no episode has ended
     """
-    steps, returns, successes = read_monitor(folder)
+    read = []
+    for part in parts_of(folder):
+        steps, returns, successes = read_monitor(part.folder)
+        # A run that is continued from a checkpoint may have gone on itself
+        kept = steps + part.start <= part.end
+        read.append((steps[kept] + part.start, returns[kept], successes[kept]))
+    steps, returns, successes = (np.concatenate(arrays) for arrays in zip(*read, strict=True))
     if not len(steps):
         raise ValueError(f"No episode ended in {os.fspath(folder)!r}: nothing to draw.")
     return steps, returns, successes
+
+
+def check_quantity(quantity: str) -> None:
+    """
+    Check the name of what a curve shows.
+
+    :param quantity: ``"return"`` or ``"success"``
+    :raises ValueError: For another name
+    """
+    if quantity not in QUANTITIES:
+        raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
+
+
+def no_successes(folder: str | os.PathLike[str]) -> ValueError:
+    """
+    Return the error for successes that a run does not report.
+
+    :param folder: Folder of the run
+    :return: The error to raise
+    """
+    return ValueError(f"{os.fspath(folder)!r} reports no successes; draw quantity='return'.")
 
 
 def new_axes(title: str, quantity: str) -> tuple[Any, Any]:
@@ -126,30 +208,42 @@ def plot_learning_curve(
     output: str | os.PathLike[str],
     bars: Mapping[str, float] | None = None,
     title: str = "",
+    quantity: str | None = None,
 ) -> Path:
     """
-    Plot a run's success rate over joint steps, or its return if the environment does not report successes.
+    Plot a run's success rate or return over joint steps. A run that continues others is drawn with these, on one axis.
 
     :param folder: Folder of the run
     :param output: Image file to write. Its suffix selects the format
     :param bars: {name: value} of horizontal lines to compare with, in the unit of the y axis
     :param title: Title of the plot
+    :param quantity: What to plot, ``"return"`` or ``"success"``. None for successes if the environment reports them, and
+        returns otherwise
     :return: Path of the image
     :raises ImportError: If matplotlib is not installed
-    :raises ValueError: If the run has finished no episode
+    :raises ValueError: If the run has finished no episode, for another quantity, or for successes that are not reported
     """
+    check_quantity(quantity or "return")
     steps, returns, successes = read_episodes(folder)
     has_successes = not np.isnan(successes).any()
-    values = successes if has_successes else returns
+    if quantity == "success" and not has_successes:
+        raise no_successes(folder)
+    of_success = has_successes if quantity is None else quantity == "success"
+    values = successes if of_success else returns
     # A tenth of the run, so that short runs show a trend too
     window = max(1, min(500, len(values) // 10))
 
-    figure, axes = new_axes(title, "success" if has_successes else "return")
+    figure, axes = new_axes(title, "success" if of_success else "return")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
-    evaluations = read_evaluations(folder)
-    if evaluations is not None:
-        greedy = evaluations[2] if has_successes else evaluations[1]
-        axes.plot(evaluations[0], greedy, color=GREEDY, marker="o", ms=4.5, lw=1.2, label="greedy, on other episodes")
+    label: str | None = "greedy, on other episodes"
+    for part in parts_of(folder):
+        evaluations = read_evaluations(part.folder)
+        if evaluations is not None:
+            # SB3 counts the joint steps of evaluations on from those of the run before
+            kept = evaluations[0] <= part.end
+            greedy = (evaluations[2] if of_success else evaluations[1])[kept]
+            axes.plot(evaluations[0][kept], greedy, color=GREEDY, marker="o", ms=4.5, lw=1.2, label=label)
+            label = None
     for name, value in (bars or {}).items():
         axes.axhline(value, color=INK, lw=0.9, ls=(0, (5, 4)), alpha=0.6, zorder=0)
         axes.annotate(

@@ -71,6 +71,8 @@ def reason_of(error: OSError | ValueError) -> str:
     :param error: The error
     :return: What the system says, without the path, which the message has already
     """
+    if isinstance(error, FileExistsError):
+        return "a file of this name exists"
     return getattr(error, "strerror", None) or str(error)
 
 

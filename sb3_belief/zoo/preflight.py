@@ -93,7 +93,8 @@ def check_device(device: str) -> None:
     # torch raises whatever the backend raises
     except Exception as error:
         found = [f"cuda:{index}" for index in range(th.cuda.device_count())] if th.cuda.is_available() else []
-        reason = " ".join(str(error).split())[:150]
+        text = " ".join(str(error).split())
+        reason = "torch knows no such device" if text.startswith(("Expected one of", "Invalid device")) else text[:150]
         raise ConfigError(
             f"--device: {device!r} is not available here ({reason}). Allowed: {', '.join(['auto', 'cpu', *found])}."
         ) from None

@@ -198,8 +198,10 @@ def run_of(team: Path) -> tuple[str, str, Path] | None:
     """
     # Checkpoints lie one folder deeper than the final team
     for folder in list(team.resolve().parents)[:2]:
-        if (folder / RECORD).is_file() and (folder / CONFIG).is_file():
+        if (folder / RECORD).is_file():
             record = read_record(folder)
+            if not (folder / CONFIG).is_file():
+                continue
             if not (isinstance(record.get("algo"), str) and isinstance(record.get("env"), str)):
                 raise ConfigError(f"{folder / RECORD}: does not say which 'algo' and 'env' the run had: it is damaged.")
             return record["algo"], record["env"], folder / CONFIG

@@ -131,7 +131,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             env=config.env_id,
             seed=seed,
             source=config.source,
-            trained_agent=None if trained is None else str(trained),
+            trained_agent=None if trained is None else str(trained.absolute()),
             start_timesteps=team.num_timesteps,
             vec_env=options.vec_env,
             device=str(options.device),
