@@ -77,7 +77,7 @@ $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
 test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from its package
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" tests/envs $(PYTEST_ARGS)
 
-test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (a gigabyte)
+test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own (more than a gigabyte)
 	JAX_COMPILATION_CACHE_DIR=$(SMAX_VENV)/jax-cache $(SMAX_VENV)/bin/python -m pytest tests/envs/adapters/smax $(PYTEST_ARGS)
 
 # rl_zoo3 has an environment of its own, as a user's would be: without what our tests and plots need beside it

@@ -3,7 +3,7 @@
 import difflib
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.machinery import PathFinder
 from importlib.util import find_spec
@@ -27,6 +27,8 @@ class Suite:
     :param names: ``"module:callable"``. ``callable()`` returns the names of the package's environments. None if they cannot
         be listed
     :param note: One sentence about anything else that the installation needs
+    :param needs: {beginning of names: (modules, command line that installs them)} for environments that need more than the
+        suite itself
     """
 
     name: str
@@ -36,6 +38,7 @@ class Suite:
     batched: str | None = None
     names: str | None = None
     note: str = ""
+    needs: Mapping[str, tuple[tuple[str, ...], str]] = field(default_factory=dict)
 
     def missing(self) -> list[str]:
         """
@@ -44,6 +47,20 @@ class Suite:
         :return: Names of modules, in the order of ``modules``
         """
         return [module for module in self.modules if not is_installed(module)]
+
+    def missing_for(self, name: str) -> tuple[list[str], str]:
+        """
+        Return what an environment needs beyond the suite itself and is not installed.
+
+        :param name: Name of the environment
+        :return: Names of modules, and the command line that installs them
+        """
+        missing, install = [], ""
+        for beginning, (modules, command) in self.needs.items():
+            lacking = [module for module in modules if name.startswith(beginning) and not is_installed(module)]
+            if lacking:
+                missing, install = missing + lacking, command
+        return missing, install
 
     def known_names(self) -> list[str]:
         """
@@ -72,7 +89,32 @@ class Suite:
 _ADAPTERS = "sb3_belief.envs.adapters"
 
 
-def _suite(name: str, module: str, install: str, batched: bool = False, note: str = "") -> Suite:
+_ATARI = "pip install 'pettingzoo[atari]' && AutoROM --accept-license"
+_CLASSIC, _SISL = "pip install 'pettingzoo[classic]'", "pip install 'pettingzoo[sisl]'"
+# What the modules of PettingZoo's environments import
+_PETTINGZOO_NEEDS: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "atari.": (("multi_agent_ale_py", "pygame"), _ATARI),
+    "butterfly.": (("pygame",), "pip install 'pettingzoo[butterfly]'"),
+    "butterfly.pistonball": (("pymunk",), "pip install 'pettingzoo[butterfly]'"),
+    "classic.": (("pygame",), _CLASSIC),
+    "classic.chess": (("chess",), _CLASSIC),
+    "classic.hanabi": (("shimmy",), _CLASSIC),
+    "classic.leduc_holdem": (("rlcard",), _CLASSIC),
+    "classic.texas_holdem": (("rlcard",), _CLASSIC),
+    "sisl.": (("pygame",), _SISL),
+    "sisl.multiwalker": (("Box2D",), _SISL),
+    "sisl.pursuit": (("scipy",), _SISL),
+}
+
+
+def _suite(
+    name: str,
+    module: str,
+    install: str,
+    batched: bool = False,
+    note: str = "",
+    needs: Mapping[str, tuple[tuple[str, ...], str]] | None = None,
+) -> Suite:
     adapter = f"{_ADAPTERS}.{name}"
     return Suite(
         name=name,
@@ -82,6 +124,7 @@ def _suite(name: str, module: str, install: str, batched: bool = False, note: st
         batched=f"{adapter}:make_batched" if batched else None,
         names=f"{adapter}:names",
         note=note,
+        needs=needs or {},
     )
 
 
@@ -92,7 +135,7 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
         suite.name: suite
         for suite in (
             _suite("mpe", "mpe2", "pip install mpe2"),
-            _suite("pettingzoo", "pettingzoo", "pip install 'pettingzoo[all]'"),
+            _suite("pettingzoo", "pettingzoo", "pip install 'pettingzoo[all]'", needs=_PETTINGZOO_NEEDS),
             _suite("lbf", "lbforaging", "pip install lbforaging"),
             _suite("rware", "rware", "pip install rware"),
             _suite(
@@ -106,9 +149,9 @@ SUITES: Mapping[str, Suite] = MappingProxyType(
             _suite(
                 "smax",
                 "jaxmarl",
-                "pip install jaxmarl",
+                "pip install jaxmarl 'gymnasium<1.4'",
                 batched=True,
-                note="It needs gymnasium<1.4, so give it a virtual environment of its own.",
+                note="It needs Python 3.11 or later. Because of its older gymnasium give it a virtual environment of its own.",
             ),
             _suite(
                 "smac",

@@ -1,9 +1,10 @@
 """The command ``sb3-belief envs``, which lists the environments and checks whether one fits a team."""
 
 from sb3_belief.envs.registry import registered_ids
-from sb3_belief.envs.suites import SUITES
-from sb3_belief.zoo.errors import ConfigError, unknown_setting
-from sb3_belief.zoo.names import load_env
+from sb3_belief.envs.suites import SUITES, comma_separated
+from sb3_belief.zoo.checks import Location, check_call
+from sb3_belief.zoo.errors import ConfigError, cause, unknown_setting
+from sb3_belief.zoo.names import get_env, load_env
 from sb3_belief.zoo.yaml_data import parse_pairs
 
 # In the list of all suites, only this many names of each are shown
@@ -34,11 +35,20 @@ def _suite_block(name: str, full: bool = False) -> str:
     suite = SUITES[name]
     if suite.missing():
         return _block(f"{name}/<name>: not installed", [suite.install, *([suite.note] if suite.note else [])])
-    names = suite.known_names()
+    lacking = {each: suite.missing_for(each) for each in suite.known_names()}
+    names = [each for each, (modules, _) in lacking.items() if not modules]
     lines = [f"{name}/{each}" for each in (names if full else names[:_SHORT])]
     if len(names) > len(lines):
         lines.append(f"... and {len(names) - len(lines)} more: sb3-belief envs list {name}")
-    return _block(f"{name}/<name>: installed", lines)
+    # Those of one group usually lack the same, and are told in one line
+    groups: dict[tuple[str, str], list[str]] = {}
+    for each, (modules, install) in lacking.items():
+        if modules:
+            groups.setdefault((" and ".join(modules), install), []).append(each)
+    for (modules, install), each in groups.items():
+        some = comma_separated([f"{name}/{one}" for one in each], most=len(each) if full else 2)
+        lines.append(f"not installed: {some} (without {modules}): {install}")
+    return _block(f"{name}/<name>: {'partly installed' if groups else 'installed'}", lines)
 
 
 def _block(title: str, lines: list[str]) -> str:
@@ -62,10 +72,12 @@ def print_env_check(
     # Imported here, because listing environments does not need it
     from sb3_belief.envs.env_checker import check_team_env
 
-    load_env(env_id, "envs check", extra_packages)
+    make_env = load_env(env_id, "envs check", extra_packages)
+    location, n_leading = Location("--env-kwargs", extra_packages), len(get_env(env_id, "envs check").leading)
+    given = check_call(make_env, parse_pairs(env_kwargs, "--env-kwargs"), location, skip=n_leading)
     try:
-        report = check_team_env(env_id, parse_pairs(env_kwargs, "--env-kwargs"), n_steps, seed)
-    except (ValueError, ImportError) as error:
-        raise ConfigError(f"envs check: {error}") from error
+        report = check_team_env(env_id, given, n_steps, seed)
+    except Exception as error:
+        raise ConfigError(f"envs check: {cause(error)}") from error
     print(report)
     return not report.failures

@@ -144,12 +144,25 @@ def test_the_list_says_what_is_there_and_how_to_get_the_rest(monkeypatch, capsys
     for line in ("  traffic-junction-medium", f"  {SPREAD}", "mpe/<name>: installed", "smac/<name>: not installed"):
         assert f"{line}\n" in said
     assert f"  {SUITES['smac'].install}\n  Not 'pip install smac', which installs another project" in said
-    assert "  ... and " in said and "sb3-belief envs list pettingzoo" in said
+    assert "  ... and " in said and "sb3-belief envs list lbf" in said
     assert main(["envs", "list", "pettingzoo"]) == 0
     said = capsys.readouterr().out
     assert "pettingzoo/sisl.pursuit" in said and "..." not in said
     assert main(["envs", "list", "smack"]) == 2
     assert "unknown suite 'smack'. Did you mean 'smac'" in capsys.readouterr().err
+
+
+def test_the_list_tells_what_single_environments_lack(monkeypatch, capsys):
+    is_installed = suites.is_installed
+    there = {"multi_agent_ale_py": False, "Box2D": True, "pygame": True, "scipy": True}
+    monkeypatch.setattr(suites, "is_installed", lambda module: there.get(module, is_installed(module)))
+    assert main(["envs", "list", "pettingzoo"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "pettingzoo/<name>: partly installed"
+    assert any(line.startswith("  pettingzoo/sisl.multiwalker") for line in lines)
+    assert not any(line.startswith("  pettingzoo/atari") for line in lines)
+    atari = next(line for line in lines if "multi_agent_ale_py" in line)
+    assert "not installed: pettingzoo/atari." in atari and atari.endswith("'pettingzoo[atari]' && AutoROM --accept-license")
 
 
 def test_the_check_says_what_to_change(own_module, capsys):
