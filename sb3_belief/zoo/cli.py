@@ -106,6 +106,9 @@ def _add_env_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
     _add_env_options(parser)
+    parser.add_argument(
+        "--trust", action="store_true", help="load a saved team even if it could run any code, because you know who made it"
+    )
     parser.add_argument("--device", default="auto", help="device of all models: auto, cpu, cuda, ...")
 
 
@@ -281,17 +284,22 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
         config = resume_config(args.trained_agent, args.algo, args.env, **settings)
     names = (
         "log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
-        " vec_env device num_threads jobs progress trained_agent verbose"
+        " vec_env device num_threads jobs progress trained_agent trust verbose"
     )
     seed = None if args.seed is None else args.seed[0]
-    options = TrainOptions(seed=seed, **{name: getattr(args, name) for name in names.split()}, command=command)
+    options = TrainOptions(
+        seed=seed,
+        **{name: getattr(args, name) for name in names.split()},
+        extra_packages=tuple(args.allow_package),
+        command=command,
+    )
     return 0 if train(config, options).finished else 130
 
 
 def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
-    names = "run env episodes n_timesteps deterministic seed output fps device"
+    names = "run env trust episodes n_timesteps deterministic seed output fps device"
     enjoy(
         EnjoyOptions(
             **{name: getattr(args, name) for name in names.split()},

@@ -18,6 +18,7 @@ from sb3_belief.zoo.evaluate import Outcome
 from sb3_belief.zoo.names import get_env, load_env
 from sb3_belief.zoo.preflight import check_device, check_output
 from sb3_belief.zoo.run_folder import CONFIG, RECORD, find_team, run_of
+from sb3_belief.zoo.trust import check_saved_team
 from sb3_belief.zoo.yaml_data import parse_pairs
 
 # Least side of a picture in pixels, as far as whole factors allow it
@@ -39,7 +40,8 @@ class EnjoyOptions:
     :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
     :param fps: Frames per second of the file, or None for the environment's own rate
     :param env_kwargs: ``key:value`` pairs of arguments of the environment, which override those of the run
-    :param extra_packages: See ``names.resolve``
+    :param extra_packages: See ``names.resolve`` and ``trust.check_saved_team``
+    :param trust: Whether to load the team without looking at what it names
     :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     """
 
@@ -53,6 +55,7 @@ class EnjoyOptions:
     fps: int | None = None
     env_kwargs: tuple[str, ...] = ()
     extra_packages: tuple[str, ...] = ()
+    trust: bool = False
     device: str = "auto"
 
 
@@ -70,7 +73,10 @@ def enjoy(options: EnjoyOptions) -> Outcome:
         check_output(options.output, "--output")
     check_device(options.device)
     path = find_team(options.run, "enjoy")
-    shown = _with_render_mode(_environment_of(path, options), options)
+    shown = _environment_of(path, options)
+    if not options.trust:
+        check_saved_team(path, "enjoy", options.extra_packages)
+    shown = _with_render_mode(shown, options)
     with _refusals_as_config_errors(shown):
         env = make_team_env(shown.env_id, seed=options.seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
     try:

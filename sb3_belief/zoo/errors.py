@@ -56,8 +56,10 @@ def cause(error: BaseException) -> str:
     :return: One line
     """
     # Notes say which agent or environment copy it was
-    text = shorten(" ".join(" ".join([str(error), *getattr(error, "__notes__", [])]).split()))
-    if isinstance(error, ValueError) and text:
+    sentences = [str(error), *getattr(error, "__notes__", [])] if str(error) else []
+    text = shorten(" ".join(" ".join(f"{sentence.rstrip('. ')}." for sentence in sentences).split()))
+    # SB3 explains itself in assertions too
+    if isinstance(error, ValueError | AssertionError) and text:
         return text
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

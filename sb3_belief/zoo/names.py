@@ -87,7 +87,14 @@ def get_algo(name: str, where: str = "--algo") -> Algo:
     return ALGOS[name]
 
 
-def _is_allowed(module: str, packages: tuple[str, ...]) -> bool:
+def is_allowed(module: str, packages: tuple[str, ...]) -> bool:
+    """
+    Return whether a module belongs to one of some packages.
+
+    :param module: Full name of the module
+    :param packages: Names of packages, or of parts of packages
+    :return: Whether it is one of them, or lies in one
+    """
     return any(module == package or module.startswith(package + ".") for package in packages)
 
 
@@ -110,7 +117,7 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     if not module_name or not all(part.isidentifier() for part in path.split(".")):
         raise ConfigError(f"{where}: {short(path)} is not a dotted path such as 'supersuit.frame_stack_v1'.")
     allowed = f"Allowed: what {', '.join(packages)} define (more packages: the flag --allow-package NAME)."
-    if not _is_allowed(module_name, packages):
+    if not is_allowed(module_name, packages):
         root = path.split(".")[0]
         raise ConfigError(f"{where}: {path!r} is not of an allowed package.{suggestion(root, packages)} {allowed}")
     try:
@@ -126,7 +133,7 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
         public = [attr for attr in dir(module) if not attr.startswith("_")]
         raise ConfigError(f"{where}: {module_name!r} has no {name!r} ({error}).{suggestion(name, public)} {allowed}") from None
     is_code = inspect.isclass(found) or inspect.isfunction(found)
-    if not is_code or not _is_allowed(found.__module__, packages):
+    if not is_code or not is_allowed(found.__module__, packages):
         raise ConfigError(f"{where}: {path!r} is not a class or function that its package defines itself. {allowed}")
     return found
 

@@ -15,7 +15,7 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.versions import versions
-from sb3_belief.envs.suites import SUITES
+from sb3_belief.envs.suites import SUITES, comma_separated
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short
 
 CONFIG = "config.yml"
@@ -163,8 +163,10 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
     if not os.path.isdir(path):
         raise ConfigError(f"{flag}: no file or folder {str(path)!r}. Give a run's folder or a saved team's zip.")
     if not (path / TEAM).is_file():
-        others = sorted(str(file.relative_to(path)) for file in path.rglob("*.zip"))
-        raise ConfigError(f"{flag}: no {TEAM} in {str(path)!r}. Give one of its zips: {', '.join(others) or 'it has none'}.")
+        # Not deeper: checkpoints lie one folder below, and the folder may be any
+        others = sorted(file.relative_to(path).as_posix() for pattern in ("*.zip", "*/*.zip") for file in path.glob(pattern))
+        names = comma_separated(others, most=10) or "it has none"
+        raise ConfigError(f"{flag}: no {TEAM} in {str(path)!r}. Give one of its zips: {names}.")
     return path / TEAM
 
 

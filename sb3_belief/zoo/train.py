@@ -5,6 +5,7 @@ import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from sb3_belief.zoo.run_folder import (
     make_run_folder,
     remove_run_folder,
 )
+from sb3_belief.zoo.trust import check_saved_team
 
 # Added to the seed of the evaluation environment, so that its copies get other seeds than those of the training
 EVAL_SEED_OFFSET = 1_000_000
@@ -52,6 +54,8 @@ class TrainOptions:
         learns wholly in one of them. The result is the same for any number, to the bit on the CPU. See ``Team``
     :param progress: Whether to show a progress bar
     :param trained_agent: Folder of a run, or zip of a team, whose training is to be continued
+    :param extra_packages: See ``trust.check_saved_team``
+    :param trust: Whether to load the saved team without looking at what it names
     :param verbose: 0 for no output, 1 for the team's tables, 2 for those of the agents too
     :param command: The words of the command line, recorded in ``run.json``
     """
@@ -69,6 +73,8 @@ class TrainOptions:
     jobs: int = 1
     progress: bool = False
     trained_agent: str | None = None
+    extra_packages: tuple[str, ...] = ()
+    trust: bool = False
     verbose: int = 1
     command: list[str] = field(default_factory=lambda: list(sys.argv))
 
@@ -100,6 +106,8 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
     :raises ConfigError: If the environment or the algorithm refuses its settings. Nothing has been written in this case
     """
     trained = None if options.trained_agent is None else find_team(options.trained_agent, "--trained-agent")
+    if trained is not None and not options.trust:
+        check_saved_team(trained, "--trained-agent", options.extra_packages)
     _check_options(config, options)
     seed = int(np.random.SeedSequence().generate_state(1)[0] % 2**31) if options.seed is None else options.seed
     if options.num_threads > 0:
@@ -119,6 +127,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:
             team = make_team(config, options, env, seed, trained, folder)
+            _check_masks(team, config, env, seed)
             callbacks = _callbacks(team, config, options, folder, eval_env)
         except BaseException:
             remove_run_folder(folder)
@@ -143,6 +152,27 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             if options.verbose:
                 print(f"Run folder: {folder}  (seed {seed})")
             return _learn(team, config, options, folder, record, callbacks)
+
+
+def _check_masks(team: Team, config: RunConfig, env: TeamVecEnv, seed: int) -> None:
+    """Check that agents that need action masks get some, which sb3-contrib does at the start of the training."""
+    masked = [agent for agent, model in team.agents.items() if "action_masks" in signature(model.predict).parameters]
+    if not masked:
+        return
+    try:
+        env.reset()
+        masks = env.action_masks() or {}
+    except Exception as error:
+        raise ConfigError(f"{config.origin('env')}: {config.env_id} cannot be reset: {cause(error)}") from error
+    # The training begins with the episodes that the seed decides
+    env.seed(seed)
+    for agent in masked:
+        if agent not in masks:
+            name = config.agent(agent).algo
+            raise ConfigError(
+                f"--algo: {name} needs action masks, and {config.env_id} gives {agent!r} none. Use"
+                f" {name.replace('maskable_', '')}, or give the masks in infos[agent]['action_mask']."
+            )
 
 
 def _check_options(config: RunConfig, options: TrainOptions) -> None:
