@@ -92,6 +92,7 @@ def check_call(
     skip: int = 0,
     reserved: Mapping[str, str] | None = None,
     complete: bool = False,
+    of_env: bool = False,
 ) -> dict[str, Any]:
     """
     Check keyword arguments against the signature of the function that takes them.
@@ -101,6 +102,8 @@ def check_call(
     :param location: Where they are given
     :param skip: Number of leading arguments that the caller passes itself
     :param reserved: {argument: what to do instead} for arguments that must not be given here
+    :param of_env: Whether the function makes an environment. Then ``**kwargs`` of its own may take any argument, since
+        environments often read a configuration that no signature names; the environment itself refuses what it does not know
     :param complete: Whether these are all of the arguments, so that none without a default may be missing
     :return: The arguments as the function takes them: classes in place of dotted paths, and schedules in place of strings
         such as ``"lin_3e-4"``
@@ -111,6 +114,7 @@ def check_call(
     if not isinstance(given, dict):
         raise ConfigError(f"{location.text}: must be a mapping of arguments, not {short(given)}.")
     known, open_ended = accepted_arguments(function)
+    open_ended = open_ended or (of_env and _has_var_keyword(function))
     reserved = reserved or {}
     allowed = {name: hint for name, hint in list(known.items())[skip:] if name not in reserved}
     result = {}
@@ -129,6 +133,11 @@ def check_call(
             f" as in {{{location.text.rpartition(': ')[2]}: {{{missing[0]}: ...}}}}."
         )
     return result
+
+
+def _has_var_keyword(function: Callable[..., Any]) -> bool:
+    constructor = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    return any(each.kind == each.VAR_KEYWORD for each in inspect.signature(constructor).parameters.values())
 
 
 def _required(function: Callable[..., Any], skip: int) -> list[str]:

@@ -26,7 +26,8 @@ class _Version(argparse.Action):
     """Flag that prints the version. It is read from the file only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        parser.exit(0, f"sb3-belief {Path(__file__).parents[1].joinpath('version.txt').read_text().strip()}\n")
+        print(f"sb3-belief {Path(__file__).parents[1].joinpath('version.txt').read_text().strip()}")
+        parser.exit(0)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -260,16 +261,16 @@ def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.
 
 
 def _train(args: argparse.Namespace, command: list[str]) -> int:
-    from sb3_belief.zoo.config import load_config
-    from sb3_belief.zoo.resume import resume_config
-    from sb3_belief.zoo.train import TrainOptions, train
-
     if args.seed is not None and len(args.seed) > 1:
         seeds = " ".join(map(str, args.seed))
         raise ConfigError(
             f"--seed: a run has one seed, not {len(args.seed)}. For a run each loop over them in the shell:"
             f" for seed in {seeds}; do sb3-belief train --seed $seed ...; done"
         )
+    from sb3_belief.zoo.config import load_config
+    from sb3_belief.zoo.resume import resume_config
+    from sb3_belief.zoo.train import TrainOptions, train
+
     settings: dict[str, Any] = {
         "conf_file": args.conf_file,
         "params": args.params,

@@ -137,7 +137,9 @@ def _environment_of(team: Path, options: EnjoyOptions) -> _Shown:
     if options.env is not None:
         make_env = load_env(options.env, "--env", packages)
         given, n_leading = parse_pairs(options.env_kwargs, "--env-kwargs"), len(get_env(options.env, "--env").leading)
-        return _Shown(options.env, check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading), None)
+        return _Shown(
+            options.env, check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading, of_env=True), None
+        )
     run = run_of(team)
     if run is None:
         raise ConfigError(

@@ -74,7 +74,7 @@ def print_env_check(
 
     make_env = load_env(env_id, "envs check", extra_packages)
     location, n_leading = Location("--env-kwargs", extra_packages), len(get_env(env_id, "envs check").leading)
-    given = check_call(make_env, parse_pairs(env_kwargs, "--env-kwargs"), location, skip=n_leading)
+    given = check_call(make_env, parse_pairs(env_kwargs, "--env-kwargs"), location, skip=n_leading, of_env=True)
     try:
         report = check_team_env(env_id, given, n_steps, seed)
     except Exception as error:

@@ -24,7 +24,10 @@ def shorten(text: str) -> str:
     :param text: The message
     :return: The message with the middle of each long bracketed list left out
     """
-    return re.sub(rf"\[[-+\d.,\s\[\]aefin]{{{_LONG},}}\]", lambda match: _ends(match[0]), text)
+    # Arrays of numpy, which have no commas and may be nested, and lists of Python
+    for separators in (r"\[\]", ","):
+        text = re.sub(rf"\[[-+\d.\saefin{separators}]{{{_LONG},}}\]", lambda match: _ends(match[0]), text)
+    return text
 
 
 def _ends(numbers: str) -> str:

@@ -125,7 +125,7 @@ class SettingsChecker:
         if key == "normalize" and isinstance(value, dict):
             return check_call(VecNormalize, value, location, skip=1)
         if key in ("env_kwargs", "eval_env_kwargs"):
-            return check_call(self.make_env, value, location, skip=self.n_leading)
+            return check_call(self.make_env, value, location, skip=self.n_leading, of_env=True)
         if key == "env_wrapper":
             return tuple(self._check_calls(value, location, skip=1))
         if key == "visibility":
