@@ -316,16 +316,16 @@ def _to_run_config(
 
 def _agent_config(agent: str, own: dict[str, Any], common: AgentConfig, origins: dict[str, str]) -> AgentConfig:
     name = own.get("algo", common.algo)
-    kwargs = {key: value for key, value in own.items() if key not in ("algo", "policy")}
-    if name == common.algo:
-        return AgentConfig(name, common.algo_class, own.get("policy", common.policy), merge(common.algo_kwargs, kwargs))
-    # The settings of all agents are arguments of another algorithm, so this agent has none but its own
     algo = get_algo(name)
     algo_class, policy = algo.load(), own.get("policy", common.policy)
     if policy not in algo_class.policy_aliases:
-        where = f"{origins['agent_kwargs']}: agent_kwargs: {agent}"
         raise ConfigError(
-            f"{where}: {name} has no {policy!r}: give this agent a policy of its own. Allowed:"
-            f" {', '.join(algo_class.policy_aliases)}."
+            f"{origins['agent_kwargs']}: agent_kwargs: {agent}: {name} has no {policy!r}: give this agent a policy of its own."
+            f" Allowed: {', '.join(algo_class.policy_aliases)}."
         )
+    kwargs = {key: value for key, value in own.items() if key not in ("algo", "policy")}
+    # The settings of all agents are arguments of another class, where even the same name may mean something else (n_steps)
+    if algo_class is common.algo_class:
+        shared = {key: value for key, value in common.algo_kwargs.items() if key not in get_algo(common.algo).fixed}
+        kwargs = merge(shared, kwargs)
     return AgentConfig(name, algo_class, policy, {**kwargs, **algo.fixed})
