@@ -94,7 +94,9 @@ def learn(
     if path.is_file():
         record = json.loads(path.read_text(encoding="utf-8"))
         if {key: record.get(key) for key in decisive} == decisive:
-            return Learned(**record["learned"])
+            kept = record["learned"]
+            # JSON knows no tuples
+            return Learned(**{**kept, "sampled": tuple(kept["sampled"]), "greedy": tuple(kept["greedy"])})
     start = time.process_time()
     # No evaluations during the training, since they would count as its time
     result = train(config, TrainOptions(seed=seed, log_folder=log_folder, eval_freq=-1, verbose=0))

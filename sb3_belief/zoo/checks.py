@@ -136,13 +136,13 @@ def check_call(
 
 
 def _has_var_keyword(function: Callable[..., Any]) -> bool:
-    constructor = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    constructor = function.__init__ if inspect.isclass(function) else function
     return any(each.kind == each.VAR_KEYWORD for each in inspect.signature(constructor).parameters.values())
 
 
 def _required(function: Callable[..., Any], skip: int) -> list[str]:
     """Return the arguments without a default, after those that the caller passes itself."""
-    constructor = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    constructor = function.__init__ if inspect.isclass(function) else function
     parameters = list(inspect.signature(constructor).parameters.values())[skip + inspect.isclass(function) :]
     named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     return [each.name for each in parameters if each.default is each.empty and each.kind in named]

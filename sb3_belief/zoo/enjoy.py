@@ -227,7 +227,7 @@ def _is_of_window(error: Exception) -> bool:
 
 
 def _frame(env: TeamVecEnv) -> np.ndarray:
-    image = env.render(mode="rgb_array")
+    image = env.get_images()[0]
     frame = None if image is None else np.asarray(image)
     if frame is None or frame.ndim != 3 or frame.shape[2] not in (3, 4):
         found = type(image).__name__ if frame is None else f"an array of shape {frame.shape}"

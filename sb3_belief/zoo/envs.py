@@ -45,9 +45,9 @@ def _suite_block(name: str, full: bool = False) -> str:
     for each, (modules, install) in lacking.items():
         if modules:
             groups.setdefault((" and ".join(modules), install), []).append(each)
-    for (modules, install), each in groups.items():
-        some = comma_separated([f"{name}/{one}" for one in each], most=len(each) if full else 2)
-        lines.append(f"not installed: {some} (without {modules}): {install}")
+    for (without, install), ids in groups.items():
+        some = comma_separated([f"{name}/{one}" for one in ids], most=len(ids) if full else 2)
+        lines.append(f"not installed: {some} (without {without}): {install}")
     return _block(f"{name}/<name>: {'partly installed' if groups else 'installed'}", lines)
 
 

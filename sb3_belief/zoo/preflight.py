@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -126,10 +126,8 @@ def check_memory(config: RunConfig, env: TeamVecEnv) -> None:
     :param env: Its environment
     :raises ConfigError: If buffers and networks need more memory than the machine has. The message has the estimate
     """
-    parts = {
-        agent: _agent_memory(config.agent(agent), config, env.observation_space[agent], env.action_space[agent])
-        for agent in env.possible_agents
-    }
+    observed, acted = cast("spaces.Dict", env.observation_space), cast("spaces.Dict", env.action_space)
+    parts = {agent: _agent_memory(config.agent(agent), config, observed[agent], acted[agent]) for agent in env.possible_agents}
     needed = sum(sum(part.values()) for part in parts.values())
     if needed > total_memory():
         agent, largest = max(parts.items(), key=lambda item: sum(item[1].values()))

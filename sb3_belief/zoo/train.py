@@ -245,24 +245,24 @@ def make_team(
     if trained is not None:
         return _load_team(config, trained, env, seed, common)
     try:
-        return Team(*_algorithms(config, env), env, seed=seed, normalize=config.normalize, **common, **_kwargs(config, env))
+        algo_class, policy, kwargs = _models(config, env)
+        return Team(algo_class, policy, env, seed=seed, normalize=config.normalize, **common, **kwargs)
     # SB3 checks action spaces and batch sizes by assertions, and torch raises a RuntimeError for what is too large
     except Exception as error:
         reason = cause(error)
         raise ConfigError(f"{config.origin(reason)}: {config.algo} cannot be set up on {config.env_id}: {reason}") from error
 
 
-def _algorithms(config: RunConfig, env: TeamVecEnv) -> tuple[Any, Any]:
+def _models(config: RunConfig, env: TeamVecEnv) -> tuple[Any, Any, dict[str, Any]]:
+    """Return class, policy and further arguments of a ``Team``: of all agents, or by agent if some have their own."""
     if not config.agents:
-        return config.algo_class, config.policy
+        return config.algo_class, config.policy, config.algo_kwargs
     agents = {name: config.agent(name) for name in env.possible_agents}
-    return {name: each.algo_class for name, each in agents.items()}, {name: each.policy for name, each in agents.items()}
-
-
-def _kwargs(config: RunConfig, env: TeamVecEnv) -> dict[str, Any]:
-    if not config.agents:
-        return config.algo_kwargs
-    return {"agent_kwargs": {name: config.agent(name).algo_kwargs for name in env.possible_agents}}
+    return (
+        {name: each.algo_class for name, each in agents.items()},
+        {name: each.policy for name, each in agents.items()},
+        {"agent_kwargs": {name: each.algo_kwargs for name, each in agents.items()}},
+    )
 
 
 def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, common: dict[str, Any]) -> Team:

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import yaml
 
@@ -27,7 +28,7 @@ def refused(words, tmp_path, monkeypatch, capsys):
     try:
         status = main(words)
     except SystemExit as stop:
-        status = stop.code
+        status = int(stop.code or 0)
     said = capsys.readouterr()
     assert status == 2 and said.err.startswith("Refused: "), said
     assert sorted(tmp_path.rglob("*")) == before
@@ -163,7 +164,7 @@ def test_long_spaces_are_shortened():
 
 def test_the_cause_of_an_error_tells_where_it_was_raised():
     try:
-        {}["missing"]
+        json.loads("{}")["missing"]
     except KeyError as error:
         assert re.fullmatch(r"KeyError: 'missing'\. \(test_command_line\.py, line \d+\)", cause(error))
     assert cause(ValueError("n is 3; it must be 4.")) == "n is 3; it must be 4."
@@ -238,8 +239,6 @@ def test_evaluations_may_have_another_environment(tmp_path, monkeypatch):
     lengths = {}
     for name, more in (("flag", ["--eval-env-kwargs", "rollout_steps:2"]), ("none", [])):
         assert main([*words, *more, "-f", name]) == 0
-        import numpy as np
-
         with np.load(next((tmp_path / name).rglob("evaluations.npz"))) as data:
             lengths[name] = set(data["ep_lengths"].ravel().tolist())
     assert lengths == {"flag": {2}, "none": {4}}

@@ -1,7 +1,9 @@
+import json
+
 import numpy as np
 import pytest
 
-from sb3_belief.report.learning_curve import plot_learning_curve, read_evaluations, read_monitor, smooth
+from sb3_belief.report.learning_curve import plot_learning_curve, read_episodes, read_evaluations, read_monitor, smooth
 
 HEADER = '#{"t_start": 0.0, "env_id": "Team"}\nr,l,t,is_success\n'
 
@@ -78,3 +80,65 @@ def test_a_run_without_an_episode_has_no_curve(tmp_path):
     (tmp_path / "monitor.csv").write_text(HEADER)
     with pytest.raises(ValueError, match="No episode ended"):
         plot_learning_curve(tmp_path, tmp_path / "curve.png")
+
+
+@pytest.mark.parametrize("cut", ["-2.0,5", "-2.0,5,0.3,Tr", "-2.0,5,0.3,", "-2.0,50,0.3,True", "-"])
+def test_a_last_line_that_is_cut_off_is_left_out(cut, tmp_path):
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n-2.5,20,0.2,False\n" + cut)
+    steps, returns, successes = read_monitor(tmp_path)
+    assert (steps.tolist(), returns.tolist(), successes.tolist()) == ([20, 40], [-1.5, -2.5], [1, 0])
+    for text in ("", HEADER[:20], HEADER[:-1]):
+        (tmp_path / "monitor.csv").write_text(text)
+        assert [len(array) for array in read_monitor(tmp_path)] == [0, 0, 0]
+
+
+def test_another_damaged_line_is_named(tmp_path):
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n-2.5,2\n0.0,5,0.3,True\n")
+    with pytest.raises(ValueError, match=r"monitor\.csv, line 4: '-2\.5,2' is not an episode"):
+        read_monitor(tmp_path)
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n")
+    (tmp_path / "evaluations.npz").write_bytes(b"PK cut")
+    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
+        read_evaluations(tmp_path)
+
+
+def test_runs_that_continue_others_share_one_axis(tmp_path, figures):
+    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
+    for folder, start, trained in (
+        (first, 0, None),
+        (second, 20, first / "checkpoints" / "x.zip"),
+        (third, 40, second / "team.zip"),
+    ):
+        folder.mkdir()
+        (folder / "monitor.csv").write_text(HEADER + "".join(f"{start + 10 * i + 1}.0,10,0.1,True\n" for i in range(3)))
+        record = {"start_timesteps": start, "trained_agent": None if trained is None else str(trained)}
+        (folder / "run.json").write_text(json.dumps(record))
+        np.savez(folder / "evaluations.npz", timesteps=[start + 10, start + 30], results=[[start], [start + 1]])
+    steps, returns, _ = read_episodes(third)
+    # A run that was continued from a checkpoint goes on itself; what it did then is another training
+    assert steps.tolist() == [10, 20, 30, 40, 50, 60, 70] and returns.tolist() == [1, 11, 21, 31, 41, 51, 61]
+    plot_learning_curve(third, tmp_path / "curve.png", quantity="return")
+    lines = figures[-1].axes[0].get_lines()
+    assert [line.get_xdata().tolist() for line in lines[1:]] == [[10], [30], [50, 70]]
+    assert len(figures[-1].axes[0].get_legend().get_texts()) == 2
+    for path in first.iterdir():
+        path.unlink()
+    # Without the first run the others keep their place
+    assert read_episodes(third)[0].tolist() == [30, 40, 50, 60, 70]
+
+
+def test_return_or_success_at_choice(tmp_path, figures):
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n-0.5,20,0.2,False\n")
+    for quantity, label, values in (
+        (None, "success rate", [1.0, 0.0]),
+        ("success", "success rate", [1.0, 0.0]),
+        ("return", "team return per episode", [-1.5, -0.5]),
+    ):
+        plot_learning_curve(tmp_path, tmp_path / "curve.png", quantity=quantity)
+        _, y_label, (curve,), _ = drawn(figures)
+        assert y_label == label and list(curve.get_ydata()) == values
+    with pytest.raises(ValueError, match="quantity is 'reward'; it must be one of 'return', 'success'"):
+        plot_learning_curve(tmp_path, tmp_path / "curve.png", quantity="reward")
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,\n")
+    with pytest.raises(ValueError, match="reports no successes"):
+        plot_learning_curve(tmp_path, tmp_path / "curve.png", quantity="success")

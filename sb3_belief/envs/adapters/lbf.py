@@ -63,7 +63,7 @@ class Foraging(DrawnTupleEnv):
         for row, column in np.argwhere(self.game.field):
             picture.square(row, column, _FOOD, str(self.game.field[row, column]), size=0.7)
         for index, player in enumerate(self.game.players):
-            picture.disc(*player.position, AGENT_COLOURS[index % len(AGENT_COLOURS)], str(player.level))
+            picture.disc(player.position[0], player.position[1], AGENT_COLOURS[index % len(AGENT_COLOURS)], str(player.level))
         return picture.image()
 
     def _is_success(self) -> bool:
