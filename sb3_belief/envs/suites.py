@@ -55,7 +55,8 @@ class Suite:
         :param name: Name of the environment
         :return: Names of modules, and the command line that installs them
         """
-        missing, install = [], ""
+        missing: list[str] = []
+        install = ""
         for beginning, (modules, command) in self.needs.items():
             lacking = [module for module in modules if name.startswith(beginning) and not is_installed(module)]
             if lacking:
