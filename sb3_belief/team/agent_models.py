@@ -134,11 +134,7 @@ class AgentModels:
             agents.rngs[agent] = RngState(None if seed is None else agent_seed(seed, k))
             with RngSwitch(agents.rngs[agent]):
                 file = io.BytesIO(saved.models[agent])
-                try:
-                    agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
-                except Exception as error:
-                    add_note(error, f"Raised while the saved model of agent {agent!r} was loaded.")
-                    raise
+                agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
         return agents
 
     def move(self, loop: JointLoop) -> None:

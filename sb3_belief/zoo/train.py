@@ -118,6 +118,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         stack.callback(env.close)
         config.check_agents(env.possible_agents)
         check_memory(config, env)
+        _check_masks(config, env)
         eval_env = None
         if options.eval_freq > 0:
             eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
@@ -127,7 +128,6 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:
             team = make_team(config, options, env, seed, trained, folder)
-            _check_masks(team, config, env, seed)
             callbacks = _callbacks(team, config, options, folder, eval_env)
         except BaseException:
             remove_run_folder(folder)
@@ -154,18 +154,18 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             return _learn(team, config, options, folder, record, callbacks)
 
 
-def _check_masks(team: Team, config: RunConfig, env: TeamVecEnv, seed: int) -> None:
+def _check_masks(config: RunConfig, env: TeamVecEnv) -> None:
     """Check that agents that need action masks get some, which sb3-contrib does at the start of the training."""
-    masked = [agent for agent, model in team.agents.items() if "action_masks" in signature(model.predict).parameters]
+    classes = {agent: config.agent(agent).algo_class for agent in env.possible_agents}
+    masked = [agent for agent, algo_class in classes.items() if "action_masks" in signature(algo_class.predict).parameters]
     if not masked:
         return
     try:
+        # The team seeds the environment once it is made, so that this reset changes nothing of the training
         env.reset()
         masks = env.action_masks() or {}
     except Exception as error:
-        raise ConfigError(f"{config.origin('env')}: {config.env_id} cannot be reset: {cause(error)}") from error
-    # The training begins with the episodes that the seed decides
-    env.seed(seed)
+        raise ConfigError(f"{config.source}: {config.env_id} cannot be reset: {cause(error)}") from error
     for agent in masked:
         if agent not in masks:
             name = config.agent(agent).algo

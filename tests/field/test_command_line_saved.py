@@ -153,7 +153,7 @@ def test_a_word_of_trust_loads_anything(name, runs, tmp_path, monkeypatch, capsy
         ("empty", "run.json: must be a mapping, not list"),
         ("model", "the file of agent 'follower' cannot be read"),
         ("statistics", "the file of agent 'follower' cannot be read"),
-        ("weights", "Raised while the saved model of agent 'follower' was loaded"),
+        ("weights", "the file of agent 'follower' cannot be read"),
         ("single.zip", "it is the zip of a single SB3 model"),
     ],
 )
