@@ -1,11 +1,15 @@
-"""Actions of one agent's model outside of its own ``learn()``."""
+"""Actions of the agents' models outside of their own ``learn()``."""
 
 import inspect
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_belief.team.arguments import check_agent_keys
+from sb3_belief.vec_env.team_vec_env import TeamObs
 
 # Recurrent state of a policy, as SB3's predict() takes and returns it
 PolicyState = tuple[np.ndarray, ...] | None
@@ -59,3 +63,62 @@ class Predictor:
         """
         actions, self._state = self.predict(obs, self._state, episode_start, masks=masks)
         return actions
+
+
+class TeamPredictor:
+    """
+    Predicts for the agents of a team: all of them, or those that are in play.
+
+    :param models: The models by agent
+    :param statistics: The normalisation of the agents that have one
+    """
+
+    def __init__(self, models: Mapping[str, BaseAlgorithm], statistics: Mapping[str, VecNormalize]):
+        self._models, self._statistics = models, statistics
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether a model takes action masks."""
+        return any(Predictor(model, None).takes_masks for model in self._models.values())
+
+    def predict(
+        self,
+        observation: Mapping[str, Any],
+        state: Mapping[str, PolicyState] | None,
+        episode_start: np.ndarray | None,
+        deterministic: bool,
+        action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None,
+    ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
+        """
+        Predict as ``Team.predict`` does.
+
+        :param observation: As there
+        :param state: As there
+        :param episode_start: As there
+        :param deterministic: As there
+        :param action_masks: As there
+        :return: As there
+        :raises TypeError: If the observation is not a dict
+        :raises ValueError: If an agent is unknown
+        """
+        if not isinstance(observation, Mapping):
+            raise TypeError(
+                f"A team predicts from {{agent: observation}}, not from {type(observation).__name__}; a single agent's model,"
+                " team.agents[name], predicts from its own observation."
+            )
+        check_agent_keys("The observation", observation, list(self._models))
+        if action_masks is not None and not isinstance(action_masks, Mapping):
+            action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
+        actions: TeamObs = {}
+        # Those who are absent keep the states that they had
+        states: dict[str, PolicyState] = {agent: None if state is None else state.get(agent) for agent in self._models}
+        for agent, model in self._models.items():
+            if agent in observation:
+                actions[agent], states[agent] = Predictor(model, self._statistics.get(agent)).predict(
+                    observation[agent],
+                    states[agent],
+                    episode_start,
+                    deterministic,
+                    None if action_masks is None else action_masks.get(agent),
+                )
+        return actions, states if any(s is not None for s in states.values()) else None

@@ -26,7 +26,7 @@ from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
-from sb3_belief.team.predictor import PolicyState
+from sb3_belief.team.predictor import PolicyState, TeamPredictor
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
 SelfTeam = TypeVar("SelfTeam", bound="Team")
@@ -110,6 +110,7 @@ class Team:
     ) -> None:
         self._loop = loop
         self._agents = agents
+        self._predictor = TeamPredictor(agents.models, agents.statistics)
         self._scripted = scripted
         self.possible_agents = list(agents.models)
         self.seed = seed
@@ -246,39 +247,28 @@ class Team:
         action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None = None,
     ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
         """
-        Predict the actions of all agents.
+        Predict the actions of all agents, or of those that are still in play.
 
-        :param observation: Observations by agent, ``[n_envs, ...]`` or a single one each; normalised here if the team is
+        So PettingZoo's own loop works: ``actions, state = team.predict(observations, state)`` for as long as ``env.agents``.
+
+        :param observation: Observations by agent, ``[n_envs, ...]`` or a single one each, of all agents or some of them;
+            normalised here if the team is
         :param state: Recurrent states as returned by the last call, None at first
         :param episode_start: Where recurrent states start anew, bool ``[n_envs]``
         :param deterministic: Whether to take the most likely actions instead of samples
         :param action_masks: Masks by agent, bool ``[n_envs, k]``, for models that take masks (``env.action_masks()``); or a
             sequence of each copy's masks, as sb3-contrib's ``MaskableEvalCallback`` and ``evaluate_policy`` pass them on
-        :return: Action(s) by agent, and the recurrent states (None if no agent has any)
-        :raises ValueError: If an agent's observation is missing
+        :return: Action(s) of the agents that were given, and the recurrent states of all agents, in which absent ones keep
+            theirs (None if no agent has any)
+        :raises ValueError: If an agent is unknown
         """
-        missing = [agent for agent in self.possible_agents if agent not in observation]
-        if missing:
-            raise ValueError(f"No observation for {missing}; a team predicts from {{agent: observation}} of all its agents.")
-        if action_masks is not None and not isinstance(action_masks, Mapping):
-            action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
         self._parallel.sync_models()
-        actions: TeamObs = {}
-        states: dict[str, PolicyState] = {}
-        for agent in self.possible_agents:
-            actions[agent], states[agent] = self._agents.predictor(agent).predict(
-                observation[agent],
-                None if state is None else state[agent],
-                episode_start,
-                deterministic,
-                None if action_masks is None else action_masks.get(agent),
-            )
-        return actions, states if any(s is not None for s in states.values()) else None
+        return self._predictor.predict(observation, state, episode_start, deterministic, action_masks)
 
     @property
     def takes_masks(self) -> bool:
         """Whether a model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
-        return any(self._agents.predictor(agent).takes_masks for agent in self.possible_agents)
+        return self._predictor.takes_masks
 
     def save(self, path: str | os.PathLike | io.BufferedIOBase) -> None:
         """
