@@ -84,6 +84,10 @@ class TeamVecEnv(VecEnv):
         self._writers: list[ResultsWriter] = []
         self._actions: TeamObs = {}
         self._action_shapes = {agent: (num_envs, *(action_spaces[agent].shape or ())) for agent in self.possible_agents}
+        #: What the last step returned, whatever wrappers make of it: team rewards and dones, ``[num_envs]``, and the agents'
+        #: own rewards, ``[num_envs, n]``
+        self.last_rewards, self.last_dones = np.zeros(num_envs, dtype=np.float32), np.zeros(num_envs, dtype=bool)
+        self.last_agent_rewards = np.zeros((num_envs, len(self.possible_agents)), dtype=np.float32)
         self._t_start = time.time()
         self._zero_episode_sums()
 
@@ -224,8 +228,11 @@ class TeamVecEnv(VecEnv):
 
     def _monitor_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Add a step to the episodes' returns, and where an episode has ended, put them into its info and into the files."""
+        agent_rewards = np.concatenate([info["agent_rewards"] for info in infos]).reshape(self._agent_returns.shape)
+        # Copies, since wrappers may write into the arrays
+        self.last_rewards, self.last_dones, self.last_agent_rewards = rewards.copy(), dones.copy(), agent_rewards
         self._team_returns += rewards
-        self._agent_returns += np.concatenate([info["agent_rewards"] for info in infos]).reshape(self._agent_returns.shape)
+        self._agent_returns += agent_rewards
         self._lengths += 1
         for env_idx in np.flatnonzero(dones):
             info = infos[env_idx]

@@ -35,6 +35,7 @@ from sb3_belief.team.lockstep.scheduler import (
     AgentTask,
     Scheduler,
 )
+from sb3_belief.team.lockstep.wrapper_check import WrapperCheck
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.vec_env.agent_vec_env import AgentTransition, TransitionSplitter
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
@@ -191,6 +192,7 @@ class JointLoop(Scheduler):
         self.env = env
         self.possible_agents = list(team_env.possible_agents)
         self._team_env = team_env
+        self._wrapper_check = WrapperCheck(env)
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
         self._groups: Sequence[AgentGroup] = ()
@@ -355,6 +357,8 @@ class JointLoop(Scheduler):
         self.n_steps += 1
         self._continues = True
         step: TeamStep = self.env.step(actions)  # type: ignore[arg-type, assignment]
+        if self._wrapper_check.wrappers:
+            self._wrapper_check.check(step)
         self._masks_known = False
         transitions = self._splitter.transitions(actions, step)
         self._hand_out(dict(zip(self.possible_agents, transitions, strict=True)))
