@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +19,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.rng import RngState, RngSwitch
-from sb3_belief.team.arguments import as_callback
+from sb3_belief.team.arguments import as_callback, check_agent_keys
 from sb3_belief.team.checkpoint import SavedTeam
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.lockstep.scheduler import AgentTask
 from sb3_belief.team.predictor import Predictor
+from sb3_belief.team.sb3_protocol import algorithm_arguments
 
 
 class AgentSpec(NamedTuple):
@@ -37,6 +39,43 @@ class AgentSpec(NamedTuple):
     algo_class: type[BaseAlgorithm]
     policy: str | type[BasePolicy]
     kwargs: dict[str, Any]
+
+
+class LoadOptions(NamedTuple):
+    """
+    How saved models are loaded, as for SB3's ``load``.
+
+    :param device: Of the models
+    :param custom_objects: What replaces saved attributes
+    :param print_system_info: Whether to print versions
+    :param kwargs: Arguments that replace the saved ones
+    :param agent_kwargs: Those of single agents, which override ``kwargs``
+    """
+
+    device: th.device | str = "auto"
+    custom_objects: dict[str, Any] | None = None
+    print_system_info: bool = False
+    kwargs: Mapping[str, Any] = MappingProxyType({})
+    agent_kwargs: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+
+    def arguments(self, agent: str, algo_class: type[BaseAlgorithm]) -> dict[str, Any]:
+        """
+        Return the arguments of an agent's algorithm that replace the saved ones.
+
+        :param agent: Name of the agent
+        :param algo_class: Class of its model
+        :return: The arguments
+        :raises TypeError: If the class has no such argument, which SB3 would not notice
+        """
+        own = {**self.kwargs, **self.agent_kwargs.get(agent, {})}
+        known = algorithm_arguments(algo_class) - {"policy", "env"}
+        unknown = [name for name in own if name not in known]
+        if unknown:
+            raise TypeError(
+                f"{algo_class.__name__}, the algorithm of {agent!r}, has no arguments {unknown} that load() could replace; it"
+                f" has {sorted(known)}. Arguments of single agents are given in agent_kwargs."
+            )
+        return own
 
 
 def agent_seed(seed: int, index: int) -> int:
@@ -115,26 +154,42 @@ class AgentModels:
         return agents
 
     @staticmethod
-    def load(saved: SavedTeam, loop: JointLoop | None, seed: int | None, device: th.device | str) -> "AgentModels":
+    def load(saved: SavedTeam, loop: JointLoop | None, seed: int | None, options: LoadOptions) -> "AgentModels":
         """
         Load saved models. Their random number generators start anew from the seed.
 
         :param saved: The contents of a file
         :param loop: Has the agents' environments; None for models that only predict
         :param seed: The team's seed
-        :param device: Of the models
+        :param options: How the models are loaded
         :return: The models
+        :raises TypeError: If an algorithm has no argument of a name that is given
+        :raises ValueError: If agents are unknown
         """
         agents = AgentModels(statistics=saved.statistics)
-        for k, agent in enumerate(saved.manifest["agents"]):
+        names = saved.manifest["agents"]
+        check_agent_keys("agent_kwargs", options.agent_kwargs, names)
+        classes = {agent: saved.algo_class(agent) for agent in names}
+        arguments = {agent: options.arguments(agent, algo_class) for agent, algo_class in classes.items()}
+        for k, agent in enumerate(names):
             env: VecEnv | None = None if loop is None else loop.agent_envs[agent]
             if env is not None and agent in saved.statistics:
                 saved.statistics[agent].set_venv(env)
                 env = saved.statistics[agent]
-            agents.rngs[agent] = RngState(None if seed is None else agent_seed(seed, k))
+            own_seed = None if seed is None else agent_seed(seed, k)
+            if seed != saved.manifest["seed"]:
+                arguments[agent].setdefault("seed", own_seed)
+            agents.rngs[agent] = RngState(own_seed)
             with RngSwitch(agents.rngs[agent]):
-                file = io.BytesIO(saved.models[agent])
-                agents.models[agent] = saved.algo_class(agent).load(file, env=env, device=device)
+                agents.models[agent] = classes[agent].load(
+                    io.BytesIO(saved.models[agent]),
+                    env=env,
+                    device=options.device,
+                    custom_objects=options.custom_objects,
+                    # Of one model: that of the others is the same
+                    print_system_info=options.print_system_info and k == 0,
+                    **arguments[agent],
+                )
         return agents
 
     def move(self, loop: JointLoop) -> None:

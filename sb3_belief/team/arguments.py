@@ -68,6 +68,24 @@ def check_agent_keys(name: str, given: Mapping[str, Any], agents: Sequence[str])
         raise ValueError(f"{name} has entries for unknown agents {unknown}; the agents are {list(agents)}.")
 
 
+def check_same_agents(
+    agents: list[str], scripted: dict[str, str], env_agents: list[str], env_scripted: dict[str, str]
+) -> None:
+    """
+    Check that another environment has the agents of a team.
+
+    :param agents: Names of the team's agents
+    :param scripted: Action spaces of its scripted others as text, by name and in order
+    :param env_agents: Names of the environment's agents
+    :param env_scripted: Action spaces of its scripted others
+    :raises ValueError: If they differ
+    """
+    if env_agents != agents:
+        raise ValueError(f"The team has the agents {agents}, the environment {env_agents}.")
+    if list(env_scripted.items()) != list(scripted.items()):
+        raise ValueError(f"The team has learned with the scripted others {scripted}, the environment has {env_scripted}.")
+
+
 def as_callback(callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
     """
     Convert what SB3's ``learn`` takes as a callback into one callback.

@@ -2,14 +2,15 @@
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Collection, Iterable, Sequence
 from numbers import Number
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, make_output_format
-from stable_baselines3.common.utils import get_latest_run_id
+from stable_baselines3.common.utils import get_latest_run_id, safe_mean
 
 from sb3_belief.common.file_names import file_name
 
@@ -50,17 +51,26 @@ class TeamLog:
     :param verbose: 1 or more prints the team's table to the standard output
     :param log_dir: Folder for ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV files. A name
         that cannot be part of a path is quoted (see ``file_name``)
-    :param tensorboard_log: Folder for the TensorBoard runs ``Team_<k>`` (the team) and ``Team_<k>/agents/<agent>``; None for
-        none
+    :param tensorboard_log: Folder for the TensorBoard runs ``<run_name>_<k>`` (the team) and
+        ``<run_name>_<k>/agents/<agent>``; None for none
+    :param run_name: Name of the run
     """
 
-    def __init__(self, agents: Sequence[str], verbose: int, log_dir: str | None, tensorboard_log: str | None):
+    def __init__(
+        self,
+        agents: Sequence[str],
+        verbose: int,
+        log_dir: str | None,
+        tensorboard_log: str | None,
+        run_name: str = "Team",
+    ):
+        self.run_name = run_name
         # Values that each agent has dumped since the last table, and the outputs from which each key is excluded
         self.latest: dict[str, dict[str, Any]] = {}
         self.excluded: dict[str, tuple[str, ...]] = {}
         run_dir = None
         if tensorboard_log is not None:
-            run_dir = os.path.join(tensorboard_log, f"Team_{get_latest_run_id(tensorboard_log, 'Team') + 1}")
+            run_dir = os.path.join(tensorboard_log, f"{run_name}_{get_latest_run_id(tensorboard_log, run_name) + 1}")
         self.agent_loggers = {
             agent: Logger(
                 None if log_dir is None else os.path.join(log_dir, "agents", file_name(agent)),
@@ -117,6 +127,38 @@ class TeamLog:
         """Close the files, but not the standard output."""
         for logger in [self.team_logger, *self.agent_loggers.values()]:
             logger.close()
+
+
+def record_statistics(logger: Logger, episodes: Collection[dict[str, Any]], successes: Collection[bool]) -> None:
+    """
+    Record the means over the last episodes.
+
+    :param logger: Logger of the team
+    :param episodes: What ``info["episode"]`` said of them
+    :param successes: Whether they were successes, as far as the environment says so
+    """
+    if episodes:
+        logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in episodes]))
+        logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in episodes]))
+    if successes:
+        logger.record("rollout/success_rate", safe_mean(list(successes)))
+
+
+def record_time(logger: Logger, iterations: int, num_timesteps: int, start_timesteps: int, start_time: int) -> None:
+    """
+    Record how far and how fast a team has learned.
+
+    :param logger: Logger of the team
+    :param iterations: Number of tables so far, this one included
+    :param num_timesteps: Number of timesteps so far
+    :param start_timesteps: Their number at the beginning of this ``learn()``
+    :param start_time: When it began, in nanoseconds
+    """
+    elapsed = max((time.time_ns() - start_time) / 1e9, sys.float_info.epsilon)
+    logger.record("time/iterations", iterations, exclude="tensorboard")
+    logger.record("time/fps", int((num_timesteps - start_timesteps) / elapsed))
+    logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+    logger.record("time/total_timesteps", num_timesteps, exclude="tensorboard")
 
 
 def _files(log_dir: str | None, run_dir: str | None, *folder: str) -> list[KVWriter]:

@@ -1,6 +1,6 @@
 """Code of the user's own that runs while a team learns, and may look at its models or change them at any step."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -8,6 +8,34 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
 # Callbacks of these libraries use a model only to predict and to save it
 _LIBRARIES = {"stable_baselines3", "sb3_contrib"}
+
+
+def callbacks_within(callback: BaseCallback | None) -> Iterator[BaseCallback]:
+    """
+    Iterate over a callback and the callbacks that SB3's and sb3-contrib's own ones call.
+
+    :param callback: Of a team or an agent
+    :return: The callbacks, each before those that it calls
+    """
+    if callback is None:
+        return
+    yield callback
+    if is_of_a_library(callback) and not isinstance(callback, ConvertCallback):
+        called = [
+            *getattr(callback, "callbacks", []),
+            *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
+        ]
+        for each in called:
+            yield from callbacks_within(each)
+
+
+def is_of_a_library(callback: BaseCallback) -> bool:
+    """
+    Tell whether a callback is one of SB3 or sb3-contrib.
+
+    :param callback: The callback
+    """
+    return type(callback).__module__.partition(".")[0] in _LIBRARIES
 
 
 def find_own_callback(callback: BaseCallback | None) -> Any:
@@ -18,17 +46,11 @@ def find_own_callback(callback: BaseCallback | None) -> Any:
     :param callback: Of a team
     :return: The first callback or function of the user's own; None without one
     """
-    if callback is None:
-        return None
-    if isinstance(callback, ConvertCallback):
-        return callback.callback
-    if type(callback).__module__.partition(".")[0] not in _LIBRARIES:
-        return callback
-    called = [
-        *getattr(callback, "callbacks", []),
-        *(getattr(callback, name, None) for name in ("callback", "callback_on_new_best")),
-    ]
-    return next((own for own in map(find_own_callback, called) if own is not None), None)
+    for each in callbacks_within(callback):
+        own = each.callback if isinstance(each, ConvertCallback) else None if is_of_a_library(each) else each
+        if own is not None:
+            return own
+    return None
 
 
 def runs_own_code(callbacks: Iterable[BaseCallback | None], models: Mapping[str, BaseAlgorithm]) -> bool:

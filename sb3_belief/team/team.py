@@ -2,7 +2,6 @@
 
 import io
 import os
-import sys
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -11,28 +10,28 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.rng import RngSwitch
-from sb3_belief.team.agent_models import AgentModels, AgentSpec, run_learn, team_rng
-from sb3_belief.team.arguments import as_callback, check_agent_keys, check_team_vec_env, per_agent
+from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, run_learn, team_rng
+from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
+from sb3_belief.team.callbacks import check_agent_callback
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
-from sb3_belief.team.logs import TeamLog
+from sb3_belief.team.logs import TeamLog, record_statistics, record_time
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
+from sb3_belief.team.sb3_protocol import SB3Protocol
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
 SelfTeam = TypeVar("SelfTeam", bound="Team")
 
 
-class Team:
+class Team(SB3Protocol):
     """
     One SB3 model for each agent of a team, all learning at once in one vectorised environment.
 
@@ -42,8 +41,9 @@ class Team:
     another draws. Policies of equal shape make their forward passes in one batch, with the same result to the bit. One
     timestep is one joint step of one copy of the environment.
 
-    ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps`` and ``logger`` are those of an SB3
-    model, so ``evaluate_policy`` and SB3's callbacks take a team as it is.
+    ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps``, ``logger`` and more are those of
+    an SB3 model, so ``evaluate_policy`` and SB3's callbacks take a team as it is. What all agents have in common is read like
+    a model's (``team.learning_rate``); it is set on the agents' models.
 
     :param algo_class: Class of SB3, sb3-contrib or this package for all agents, or a dict of one for each agent
     :param policy: Policy of that class for all agents, or a dict of one for each agent
@@ -117,9 +117,12 @@ class Team:
         self.normalize = normalize
         self.verbose = verbose
         self.num_timesteps = 0
-        self.ep_info_buffer: deque[dict[str, Any]] = deque(maxlen=100)
-        self.ep_success_buffer: deque[bool] = deque(maxlen=100)
-        self._log_dir, self._tensorboard_log = log_dir, tensorboard_log
+        windows = {model._stats_window_size for model in agents.models.values()}
+        # Agents with windows of their own leave the team SB3's
+        self._stats_window_size = windows.pop() if len(windows) == 1 else 100
+        self.ep_info_buffer: deque[dict[str, Any]] = deque(maxlen=self._stats_window_size)
+        self.ep_success_buffer: deque[bool] = deque(maxlen=self._stats_window_size)
+        self._log_dir, self.tensorboard_log = log_dir, tensorboard_log
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
         self._rng = team_rng(seed)
@@ -141,16 +144,8 @@ class Team:
         return self._agents.models
 
     @property
-    def observation_space(self) -> spaces.Dict:
-        """The agents' observation spaces by agent."""
-        if self._loop is not None:
-            return spaces.Dict(self._loop.observation_spaces)
-        return spaces.Dict({agent: model.observation_space for agent, model in self._agents.models.items()})
-
-    @property
-    def action_space(self) -> spaces.Dict:
-        """The agents' action spaces by agent."""
-        return spaces.Dict({agent: model.action_space for agent, model in self._agents.models.items()})
+    def _models(self) -> dict[str, BaseAlgorithm]:
+        return self._agents.models
 
     @property
     def logger(self) -> Logger:
@@ -172,6 +167,7 @@ class Team:
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         agent_callbacks: Mapping[str, MaybeCallback] | None = None,
@@ -186,6 +182,7 @@ class Team:
         :param total_timesteps: Least number of joint steps, over all copies of the environment
         :param callback: Called once per joint step with the team as its model
         :param log_interval: As each agent's algorithm takes it: iterations of on-policy ones, episodes of off-policy ones
+        :param tb_log_name: Name of the TensorBoard run, by default "Team"; it keeps the name of the first ``learn``
         :param reset_num_timesteps: True starts counting, and new episodes; False continues where the last ``learn`` ended
             (with new episodes only if it ended out of step: by a callback, an error, or with some agents finished before
             others)
@@ -193,7 +190,8 @@ class Team:
         :param agent_callbacks: Callbacks of single agents by agent, each with the agent's model as its model
         :return: The team
         :raises RuntimeError: If the team is learning already
-        :raises ValueError: If it has no environment, or if agents are unknown
+        :raises ValueError: If it has no environment, if agents are unknown, if the run has another name already, if something
+            was set on the team that belongs to its models, or if the ``EvalCallback`` of an agent has another's environment
         """
         if self._learning:
             raise RuntimeError("This team is learning already: learn() cannot be called by a callback or an agent of its own.")
@@ -202,6 +200,10 @@ class Team:
             raise ValueError("This team has no environment to learn in: use set_env(), or Team.load(path, env=env).")
         own_callbacks = agent_callbacks or {}
         check_agent_keys("agent_callbacks", own_callbacks, self.possible_agents)
+        for agent, own in own_callbacks.items():
+            check_agent_callback(agent, self._models[agent], as_callback(own))
+        self.check_nothing_set()
+        log = self._make_log(tb_log_name)
         self._learning = True
         try:
             if reset_num_timesteps:
@@ -210,7 +212,6 @@ class Team:
                 self.ep_info_buffer.clear()
                 self.ep_success_buffer.clear()
             self._start_time, self._start_timesteps = time.time_ns(), self.num_timesteps
-            log = self._make_log()
             learn = partial(
                 run_learn,
                 total_timesteps=total_timesteps,
@@ -221,14 +222,17 @@ class Team:
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
             team_callback = as_callback(callback, progress_bar)
-            progress = TeamProgress(self, team_callback, log)
+            with self.shown_arguments():
+                progress = TeamProgress(self, team_callback, log)
             with RngSwitch(self._rng):
                 if fresh:
                     for model in self.agents.values():
                         model._last_obs = None
                     loop.reset()
                 total = total_timesteps + self.num_timesteps
-                progress.on_training_start({"self": self, "total_timesteps": total, "tb_log_name": "Team", "env": loop.env})
+                progress.on_training_start(
+                    {"self": self, "total_timesteps": total, "tb_log_name": log.run_name, "env": loop.env}
+                )
             with self._parallel.distribute(loop, tasks, learn, team_callback) as groups:
                 in_step = loop.run(tasks, progress, self._rng, groups)
             with RngSwitch(self._rng):
@@ -292,10 +296,14 @@ class Team:
         path: str | os.PathLike | io.BufferedIOBase,
         env: VecEnv | None = None,
         device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
         verbose: int = 0,
         log_dir: str | None = None,
         tensorboard_log: str | None = None,
+        agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
+        **kwargs: Any,
     ) -> SelfTeam:
         """
         Load a saved team. As with SB3 the random number generators start anew from its seed.
@@ -303,12 +311,18 @@ class Team:
         :param path: Path of a saved team, with or without ".zip", or an open binary file
         :param env: Environment to learn in, whose number of copies may differ; None for a team that can only predict
         :param device: As in the constructor
+        :param custom_objects: As for each of the models: what replaces saved attributes
+        :param print_system_info: Whether to print the versions with which the team was saved, and the present ones
         :param verbose: As in the constructor
         :param log_dir: As in the constructor
         :param tensorboard_log: As in the constructor
+        :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
         :param jobs: As in the constructor
+        :param kwargs: Arguments of the algorithms that replace the saved ones (``learning_rate=1e-5``), and ``seed``, which
+            replaces that of the team
         :return: The team
         :raises FileNotFoundError: If there is no such file
+        :raises TypeError: If an agent's algorithm has no argument of that name
         :raises ValueError: If it is damaged or no saved team, if the environment does not fit it, or if ``jobs`` is wrong
         """
         check_jobs(jobs)
@@ -316,9 +330,11 @@ class Team:
         loop = None if env is None else JointLoop(check_team_vec_env(env))
         if loop is not None:
             saved.check_env(loop.env, loop.possible_agents, loop.scripted)
-        manifest, seed = saved.manifest, saved.manifest["seed"]
+        manifest = saved.manifest
+        options = LoadOptions(device, custom_objects, print_system_info, kwargs, agent_kwargs or {})
+        seed = kwargs.pop("seed", manifest["seed"])
         team = cls.__new__(cls)
-        agents = AgentModels.load(saved, loop, seed=seed, device=device)
+        agents = AgentModels.load(saved, loop, seed, options)
         team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
         team.num_timesteps = manifest["num_timesteps"]
         if env is not None and seed is not None:
@@ -340,13 +356,8 @@ class Team:
         if self._learning:
             raise RuntimeError("The environment of a team cannot be changed while it learns.")
         loop = JointLoop(check_team_vec_env(env))
-        if loop.possible_agents != self.possible_agents:
-            raise ValueError(f"The team has the agents {self.possible_agents}, the environment {loop.possible_agents}.")
-        if list(loop.scripted.items()) != list(self._scripted.items()):
-            raise ValueError(
-                f"The team has learned with the scripted others {self._scripted}, the environment has {loop.scripted}."
-            )
-        n_envs = next(iter(self.agents.values())).n_envs
+        check_same_agents(self.possible_agents, self._scripted, loop.possible_agents, loop.scripted)
+        n_envs = self.n_envs
         if env.num_envs != n_envs:
             raise ValueError(
                 f"The team's buffers are for {n_envs} copies, the environment has {env.num_envs}: save the team and use"
@@ -355,30 +366,23 @@ class Team:
         self._agents.move(loop)
         self._loop = loop
 
-    def get_vec_normalize_env(self) -> VecNormalize | None:
-        """Return None: each agent is normalised by itself, not the environment."""
-        return None
-
     def dump_logs(self) -> None:
         """Write the team's table: what has been recorded, and statistics of episodes and time."""
         self._iterations += 1
-        elapsed = max((time.time_ns() - self._start_time) / 1e9, sys.float_info.epsilon)
-        if self.ep_info_buffer:
-            self.logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in self.ep_info_buffer]))
-        if self.ep_success_buffer:
-            self.logger.record("rollout/success_rate", safe_mean(list(self.ep_success_buffer)))
-        self.logger.record("time/iterations", self._iterations, exclude="tensorboard")
-        self.logger.record("time/fps", int((self.num_timesteps - self._start_timesteps) / elapsed))
-        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer)
+        record_time(self.logger, self._iterations, self.num_timesteps, self._start_timesteps, self._start_time)
         self.logger.dump(step=self.num_timesteps)
 
-    def _make_log(self) -> TeamLog:
+    def _make_log(self, run_name: str | None) -> TeamLog:
         if self._log is None:
-            self._log = TeamLog(self.possible_agents, self.verbose, self._log_dir, self._tensorboard_log)
+            self._log = TeamLog(self.possible_agents, self.verbose, self._log_dir, self.tensorboard_log, run_name or "Team")
             for agent, model in self.agents.items():
                 self._log.connect(agent, model)
             if self._logger is None:
                 self._logger = self._log.team_logger
+        elif run_name not in (None, self._log.run_name):
+            raise ValueError(
+                f"tb_log_name is {run_name!r}, but this team's run is {self._log.run_name!r} since its first learn():"
+                " leave it out, or load the team anew (Team.load) for a run of another name."
+            )
         return self._log

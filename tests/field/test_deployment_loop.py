@@ -11,7 +11,9 @@ from tests.team.toy_envs import MaskedEnv, ScriptedEnv, ToyEnv
 RECURRENT = {**PPO_KWARGS, "policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 4}}
 
 
-@pytest.mark.parametrize("algorithm, policy, kwargs", [(PPO, "MlpPolicy", PPO_KWARGS), (RecurrentPPO, "MlpLstmPolicy", RECURRENT)])
+@pytest.mark.parametrize(
+    "algorithm, policy, kwargs", [(PPO, "MlpPolicy", PPO_KWARGS), (RecurrentPPO, "MlpLstmPolicy", RECURRENT)]
+)
 def test_pettingzoos_loop(algorithm, policy, kwargs):
     team, env = Team(algorithm, policy, make_team_env(ScriptedEnv), seed=0, **kwargs), ScriptedEnv()
     observations, _ = env.reset(seed=0)

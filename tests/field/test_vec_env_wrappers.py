@@ -1,4 +1,6 @@
-"""SB3 wrappers of a user's own around a team: what they change reaches the agents, or is refused at the first step that shows it."""
+"""SB3 wrappers of a user's own around a team: what they change reaches the agents, or is refused at once."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +51,7 @@ class ScaleForAll(Wrapper):
 
 class RepeatActions(Wrapper):
     def step_wait(self):
-        total = 0.0
+        total = np.zeros(self.num_envs)
         for _ in range(2):
             self.venv.step_async(self.actions)
             obs, rewards, dones, infos = self.venv.step_wait()
@@ -67,7 +69,8 @@ class EndEarly(Wrapper):
 
 class FlipActions(Wrapper):
     def step_async(self, actions):
-        self.venv.step_async({agent: 2 - chosen for agent, chosen in actions.items()})
+        flipped: Any = {agent: 2 - chosen for agent, chosen in actions.items()}
+        self.venv.step_async(flipped)
 
 
 class AsFloat64(Wrapper):
@@ -82,7 +85,9 @@ def learn(wrap, env=ToyEnv, **kwargs):
 
 @pytest.mark.parametrize("wrap", [Scale, ScaleInPlace, BonusAtTheEnd, RepeatActions, lambda env: VecMonitor(Scale(env))])
 def test_changed_rewards_are_refused(wrap):
-    with pytest.raises(ValueError, match=r"changes the team's rewards, from which no agent learns.*wrapper of the ParallelEnv"):
+    with pytest.raises(
+        ValueError, match=r"changes the team's rewards, from which no agent learns.*wrapper of the ParallelEnv"
+    ):
         learn(wrap)
 
 

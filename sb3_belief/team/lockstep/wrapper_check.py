@@ -10,8 +10,8 @@ class WrapperCheck:
     """
     Compares what wrappers return with what the environment within has returned.
 
-    Agents learn from their own rewards and ends, which are in the infos. A wrapper that changes the team's rewards or dones and
-    leaves the infos as they are would change what is shown, but not what is learned.
+    Agents learn from their own rewards and ends, which are in the infos. A wrapper that changes the team's rewards or dones
+    and leaves the infos as they are would change what is shown, but not what is learned.
 
     :param env: The environment of a team, with or without wrappers
     """

@@ -1,0 +1,211 @@
+"""What SB3's callbacks and other tools read of a model besides ``learn``, ``predict``, ``save`` and ``load``, for a team."""
+
+import inspect
+import io
+import os
+import pathlib
+import pickle
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_belief.team.arguments import check_agent_keys
+from sb3_belief.team.checkpoint import read_team
+
+# Arguments of algorithms that a team has itself
+_OWN = {"policy", "env", "seed", "verbose", "tensorboard_log"}
+# Attributes that follow from an algorithm's arguments, and are read like them
+_DERIVED = {"n_envs", "policy_class"}
+
+
+def algorithm_arguments(algo_class: type[BaseAlgorithm]) -> set[str]:
+    """
+    Return the names of the arguments of an algorithm.
+
+    :param algo_class: Class of the algorithm
+    :return: The names, with those of its base classes that it passes on by ``**kwargs``
+    """
+    names: set[str] = set()
+    for base in algo_class.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(base.__init__).parameters  # type: ignore[misc]
+            kinds = {parameter.kind for parameter in parameters.values()}
+            names.update(parameters)
+            if inspect.Parameter.VAR_KEYWORD not in kinds:
+                break
+    return {name for name in names - {"self", "args", "kwargs"} if not name.startswith("_")}
+
+
+class SB3Protocol:
+    """
+    Attributes and methods of an SB3 model that a ``Team`` has too.
+
+    An argument of the algorithms (``learning_rate``, ``gamma``, ``n_steps``, ...) is read like a model's,
+    ``team.learning_rate``, where all agents have the same value.
+    """
+
+    @property
+    def _models(self) -> dict[str, BaseAlgorithm]:
+        raise NotImplementedError
+
+    @property
+    def agents(self) -> dict[str, BaseAlgorithm]:
+        """The models by agent."""
+        raise NotImplementedError
+
+    def get_env(self) -> VecEnv | None:
+        """Return the team's environment, if it has one."""
+        raise NotImplementedError
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        """The agents' observation spaces by agent."""
+        return spaces.Dict({agent: model.observation_space for agent, model in self._models.items()})
+
+    @property
+    def action_space(self) -> spaces.Dict:
+        """The agents' action spaces by agent."""
+        return spaces.Dict({agent: model.action_space for agent, model in self._models.items()})
+
+    def get_vec_normalize_env(self) -> VecNormalize | None:
+        """Return None: each agent is normalised by itself, not the environment."""
+        return None
+
+    @property
+    def env(self) -> VecEnv | None:
+        """The team's environment, if it has one."""
+        return self.get_env()
+
+    def __getattr__(self, name: str) -> Any:
+        # Python asks here for what it has not found. Private names are left out: copy and pickle ask for some of them early
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        found = inspect.getattr_static(type(self), name, None)
+        if isinstance(found, property) and found.fget is not None:
+            # It has raised an AttributeError, whose message is better
+            return found.fget(self)
+        models = self._models
+        if name in self._shared_names():
+            values = {agent: getattr(model, name, None) for agent, model in models.items() if _has(model, name)}
+            # By their text, since schedules do not compare equal
+            if len(values) == len(models) and len({(type(value), repr(value)) for value in values.values()}) == 1:
+                return next(iter(values.values()))
+            raise AttributeError(
+                f"The agents of this team have no {name} in common ({values}): read team.agents[name].{name} of each."
+            )
+        if name == "set_random_seed":
+            raise AttributeError("A team is seeded by Team(..., seed=s), or by Team.load(path, seed=s).")
+        having = [agent for agent, model in models.items() if hasattr(model, name)]
+        if having:
+            raise AttributeError(f"A Team has no {name!r}, but its models have: read team.agents[{having[0]!r}].{name}.")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def _shared_names(self) -> set[str]:
+        return _DERIVED.union(*(algorithm_arguments(type(model)) for model in self._models.values())) - _OWN
+
+    @contextmanager
+    def shown_arguments(self) -> Iterator[None]:
+        """Have ``vars(team)`` show what all agents have in common within the block, for tools that record a model's dict."""
+        common = {name: getattr(self, name) for name in self._shared_names() if hasattr(self, name)}
+        vars(self).update(common)
+        try:
+            yield
+        finally:
+            for name in common:
+                vars(self).pop(name, None)
+
+    def check_nothing_set(self) -> None:
+        """
+        Check that nothing was set on the team that only its models could use.
+
+        :raises ValueError: If an argument of the algorithms was set on the team
+        """
+        for name in sorted(self._shared_names().intersection(vars(self))):
+            raise ValueError(
+                f"team.{name} was set, but the models are the agents' own: set it on each model of team.agents, or load them"
+                f" with it, Team.load(path, env=env, {name}=...)."
+            )
+
+    # Parameters
+
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """
+        Return the parameters of all models.
+
+        :return: What each model's own ``get_parameters`` returns, by agent
+        """
+        return {agent: model.get_parameters() for agent, model in self.agents.items()}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | os.PathLike | io.BufferedIOBase | Mapping[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """
+        Set the parameters of the models.
+
+        :param load_path_or_dict: File of a saved team, or parameters by agent as returned by ``get_parameters``
+        :param exact_match: As for a model: whether every agent and each of its parameters must be given
+        :param device: As for a model
+        :raises ValueError: If agents are unknown or missing, or what the models themselves raise
+        """
+        given = load_path_or_dict
+        if not isinstance(given, Mapping):
+            given = {agent: io.BytesIO(content) for agent, content in read_team(given).models.items()}
+        models = self.agents
+        check_agent_keys("load_path_or_dict", given, list(models))
+        missing = [agent for agent in models if agent not in given]
+        if missing and exact_match:
+            raise ValueError(f"There are no parameters for {missing}; exact_match=False sets those of the others.")
+        for agent, parameters in given.items():
+            models[agent].set_parameters(parameters, exact_match=exact_match, device=device)
+
+    # Replay buffers
+
+    @property
+    def replay_buffer(self) -> dict[str, Any]:
+        """
+        The replay buffers of the agents that have one, by agent.
+
+        :raises AttributeError: If none has, as for an on-policy model of SB3
+        """
+        buffers = {agent: getattr(model, "replay_buffer", None) for agent, model in self.agents.items()}
+        buffers = {agent: buffer for agent, buffer in buffers.items() if buffer is not None}
+        if not buffers:
+            raise AttributeError("No agent of this team has a replay buffer.")
+        return buffers
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffers of all agents that have one, as one file.
+
+        :param path: Path of the file, or an open binary file
+        """
+        save_to_pkl(path, self.replay_buffer)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load replay buffers. The file is unpickled, as a model's own is: load only what you trust.
+
+        :param path: Path of a file that ``save_replay_buffer`` of a team has written, or an open binary file
+        :param truncate_last_traj: As for a model
+        :raises ValueError: If the file holds something else, or buffers of agents that have none here
+        """
+        buffers = load_from_pkl(path)
+        if not isinstance(buffers, dict):
+            raise ValueError(f"{path} holds a {type(buffers).__name__}, not the replay buffers of a team by agent.")
+        check_agent_keys("The file", buffers, list(self.replay_buffer))
+        for agent, buffer in buffers.items():
+            model: Any = self.agents[agent]
+            model.load_replay_buffer(io.BytesIO(pickle.dumps(buffer)), truncate_last_traj)
+
+
+def _has(model: BaseAlgorithm, name: str) -> bool:
+    return name in algorithm_arguments(type(model)) | _DERIVED and hasattr(model, name)
