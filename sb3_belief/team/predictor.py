@@ -1,6 +1,7 @@
 """Actions of the agents' models outside of their own ``learn()``."""
 
 import inspect
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,15 @@ from sb3_belief.vec_env.team_vec_env import TeamObs
 PolicyState = tuple[np.ndarray, ...] | None
 
 
+def takes_masks(model: BaseAlgorithm) -> bool:
+    """
+    Tell whether a model's ``predict`` takes action masks.
+
+    :param model: Of an agent
+    """
+    return "action_masks" in inspect.signature(model.predict).parameters
+
+
 class Predictor:
     """
     Predicts with a model from observations as the team's environment returns them, before normalisation.
@@ -26,7 +36,7 @@ class Predictor:
     def __init__(self, model: BaseAlgorithm, statistics: VecNormalize | None):
         self._model, self._statistics = model, statistics
         #: Whether the model's ``predict`` takes action masks
-        self.takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+        self.takes_masks = takes_masks(model)
         self._state: PolicyState = None
 
     def predict(
@@ -75,11 +85,12 @@ class TeamPredictor:
 
     def __init__(self, models: Mapping[str, BaseAlgorithm], statistics: Mapping[str, VecNormalize]):
         self._models, self._statistics = models, statistics
+        self._has_warned = False
 
     @property
     def takes_masks(self) -> bool:
         """Whether a model takes action masks."""
-        return any(Predictor(model, None).takes_masks for model in self._models.values())
+        return any(map(takes_masks, self._models.values()))
 
     def predict(
         self,
@@ -107,6 +118,13 @@ class TeamPredictor:
                 " team.agents[name], predicts from its own observation."
             )
         check_agent_keys("The observation", observation, list(self._models))
+        if action_masks is None and not self._has_warned and self.takes_masks:
+            self._has_warned = True
+            warnings.warn(
+                "A team whose models take action masks predicts without any, and so with other actions than in training. SB3's"
+                " own evaluate_policy and EvalCallback pass none: use those of sb3_contrib.common.maskable (evaluation,"
+                " callbacks.MaskableEvalCallback), or team.predict(obs, action_masks=env.action_masks())."
+            )
         if action_masks is not None and not isinstance(action_masks, Mapping):
             action_masks = {agent: np.stack([copy[agent] for copy in action_masks]) for agent in action_masks[0]}
         actions: TeamObs = {}

@@ -23,6 +23,7 @@ from sb3_belief.team.callbacks import check_agent_callback
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
+from sb3_belief.team.masks import warn_of_unmasked_evaluation, warn_of_unmasked_models
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
 from sb3_belief.team.sb3_protocol import SB3Protocol
@@ -202,6 +203,7 @@ class Team(SB3Protocol):
         check_agent_keys("agent_callbacks", own_callbacks, self.possible_agents)
         for agent, own in own_callbacks.items():
             check_agent_callback(agent, self._models[agent], as_callback(own))
+            warn_of_unmasked_evaluation({agent: self._models[agent]}, as_callback(own))
         self.check_nothing_set()
         log = self._make_log(tb_log_name)
         self._learning = True
@@ -222,6 +224,7 @@ class Team(SB3Protocol):
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
             team_callback = as_callback(callback, progress_bar)
+            warn_of_unmasked_evaluation(self._models, team_callback)
             with self.shown_arguments():
                 progress = TeamProgress(self, team_callback, log)
             with RngSwitch(self._rng):
@@ -229,6 +232,7 @@ class Team(SB3Protocol):
                     for model in self.agents.values():
                         model._last_obs = None
                     loop.reset()
+                    warn_of_unmasked_models(self._models, loop.masks)
                 total = total_timesteps + self.num_timesteps
                 progress.on_training_start(
                     {"self": self, "total_timesteps": total, "tb_log_name": log.run_name, "env": loop.env}

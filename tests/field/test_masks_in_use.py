@@ -1,0 +1,107 @@
+"""Action masks that an environment gives and nobody uses: a warning says so, and what to use."""
+
+import warnings
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from tests.team.helpers import PPO_KWARGS, Team, make_team_env
+from tests.team.toy_envs import ToyEnv
+
+KWARGS = {**PPO_KWARGS, "n_steps": 16, "batch_size": 16}
+
+
+class Lenient(ToyEnv):
+    """Only action t mod 3 is possible: it earns 1, others cost 1. Agents ``but`` are given no mask."""
+
+    def __init__(self, but=()):
+        super().__init__()
+        self.but = but
+
+    def infos(self):
+        mask = np.arange(3) == self.t % 3
+        return {agent: {} if agent in self.but else {"action_mask": mask} for agent in self.agents}
+
+    def step(self, actions):
+        possible = self.t % 3
+        obs, _, terminations, truncations, infos = super().step(actions)
+        return obs, {agent: 1.0 if a == possible else -1.0 for agent, a in actions.items()}, terminations, truncations, infos
+
+
+class MultiDiscrete(Lenient):
+    def action_space(self, agent):
+        return spaces.MultiDiscrete([2, 2])
+
+    def infos(self):
+        return {agent: {"action_mask": np.array([1, 0, 1, 1])} for agent in self.agents}
+
+    def step(self, actions):
+        return super().step({agent: 0 for agent in actions})
+
+
+def masked_team(**kwargs):
+    return Team(MaskablePPO, "MlpPolicy", make_team_env(Lenient, n_envs=2, seed=0), seed=0, **KWARGS, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "algorithm, policy, kwargs, instead",
+    [
+        (PPO, "MlpPolicy", KWARGS, "PPO takes none: .* Use MaskablePPO;"),
+        (BeliefPPO, "BeliefPolicy", {**KWARGS, "belief": "none"}, "BeliefPPO takes none: .* Use MaskableBeliefPPO;"),
+        (A2C, "MlpPolicy", {}, "A2C takes none: .* Use MaskablePPO or MaskableBeliefPPO;"),
+    ],
+)
+@pytest.mark.parametrize("env", [Lenient, MultiDiscrete])
+def test_an_algorithm_without_masks(algorithm, policy, kwargs, instead, env):
+    team = Team(algorithm, policy, make_team_env(env, n_envs=2), seed=0, **kwargs)
+    with pytest.warns(
+        UserWarning, match=rf"gives action masks to \['agent_0', 'agent_1'\], and {instead}.*MaskableEvalCallback"
+    ):
+        team.learn(32)
+
+
+def test_only_those_who_are_given_masks_are_named():
+    classes = {"agent_0": PPO, "agent_1": MaskablePPO}
+    team = Team(classes, "MlpPolicy", make_team_env(Lenient), seed=0, **KWARGS)
+    with pytest.warns(UserWarning, match=r"gives action masks to \['agent_0'\]"):
+        team.learn(16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Team(classes, "MlpPolicy", make_team_env(partial(Lenient, but=["agent_0"])), seed=0, **KWARGS).learn(16)
+        Team(PPO, "MlpPolicy", make_team_env(ToyEnv), seed=0, **KWARGS).learn(16)
+
+
+@pytest.mark.parametrize("kind", [MaskablePPO, MaskableBeliefPPO])
+def test_evaluation_without_masks_warns_once_and_with_masks_does_not(kind):
+    env = partial(make_team_env, Lenient, n_envs=2, seed=1)
+    team = Team(kind, "MlpPolicy", env(), seed=0, **KWARGS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert evaluate_masked(team, env(), n_eval_episodes=4)[0] == 7
+        assert team.predict(env().reset(), action_masks=env().action_masks() or {})
+    with pytest.warns(UserWarning, match=r"predicts without any.*sb3_contrib.common.maskable") as caught:
+        mean: Any = evaluate_policy(team, env(), n_eval_episodes=4)[0]
+    assert mean < 7 and len(caught) == 1
+
+
+def test_callbacks_that_evaluate_without_masks_are_told_before_training():
+    def evaluation(kind):
+        return kind(make_team_env(Lenient), n_eval_episodes=1, eval_freq=1000, verbose=0)
+
+    team = masked_team()
+    for callback in (evaluation(EvalCallback), CallbackList([EveryNTimesteps(8, evaluation(EvalCallback))])):
+        with pytest.warns(UserWarning, match=r"EvalCallback evaluates without action masks, and so \['agent_0', 'agent_1'\]"):
+            team.learn(32, callback=callback)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        team.learn(32, callback=evaluation(MaskableEvalCallback))
