@@ -26,7 +26,7 @@ def _has_spread(key: str) -> bool:
 
 class _LatestValues(KVWriter):
     """
-    Writer that passes the values of an agent's logger to the team's log, which keeps the latest.
+    Writer that passes the values of an agent's logger to the team's log, which keeps the latest of each key.
 
     :param agent: Name of the agent
     :param log: The team's log
@@ -36,7 +36,8 @@ class _LatestValues(KVWriter):
         self._agent, self._log = agent, log
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        self._log.latest[self._agent] = dict(key_values)
+        # Off-policy algorithms write once for each episode that ends in a step, and only the first time what train() recorded
+        self._log.latest.setdefault(self._agent, {}).update(key_values)
         self._log.excluded.update(key_excluded)
 
     def close(self) -> None:
@@ -67,6 +68,7 @@ class TeamLog:
         self.run_name = run_name
         # Values that each agent has dumped since the last table, and the outputs from which each key is excluded
         self.latest: dict[str, dict[str, Any]] = {}
+        self._algorithms: dict[str, str] = {}
         self.excluded: dict[str, tuple[str, ...]] = {}
         run_dir = None
         if tensorboard_log is not None:
@@ -80,7 +82,8 @@ class TeamLog:
         }
         self.team_logger = Logger(log_dir, _files(log_dir, run_dir))
         if verbose >= 1:
-            self.team_logger.output_formats.append(HumanOutputFormat(sys.stdout))
+            # Longer keys than SB3's own: it refuses two that are equal when they are cut
+            self.team_logger.output_formats.append(HumanOutputFormat(sys.stdout, max_length=100))
 
     def connect(self, agent: str, model: BaseAlgorithm) -> None:
         """
@@ -94,6 +97,7 @@ class TeamLog:
         if not model._custom_logger:
             model.set_logger(self.agent_loggers[agent])
         model.logger.output_formats.append(_LatestValues(agent, self))
+        self._algorithms[agent] = type(model).__name__
 
     def complete(self, learning: Iterable[str]) -> bool:
         """
@@ -108,20 +112,33 @@ class TeamLog:
         """
         Record the means over the agents of the values dumped since the last table, for some also the standard deviations.
 
+        What different algorithms record in training cannot be compared: ``train/loss`` becomes ``train/PPO/loss`` and
+        ``train/DQN/loss`` in a team of both.
+
         :param logger: Logger of the team
         """
         values: dict[str, list[float]] = {}
-        for dumped in self.latest.values():
+        keys: dict[str, str] = {}
+        for agent, dumped in self.latest.items():
             for key, value in dumped.items():
                 # The team records times itself; images, texts and the like are only in the agents' own logs
                 if isinstance(value, (Number, np.number)) and not key.startswith("time/"):
-                    values.setdefault(key, []).append(float(value))  # type: ignore[arg-type]
-        for key, numbers in values.items():
-            excluded = self.excluded.get(key)
-            logger.record(key, float(np.mean(numbers)), exclude=excluded)
-            if _has_spread(key) and len(self.agent_loggers) > 1:
-                logger.record(f"{key}_std", float(np.std(numbers)), exclude=excluded)
+                    shown = self._shown(agent, key)
+                    keys[shown] = key
+                    values.setdefault(shown, []).append(float(value))  # type: ignore[arg-type]
+        for shown, numbers in values.items():
+            excluded = self.excluded.get(keys[shown])
+            logger.record(shown, float(np.mean(numbers)), exclude=excluded)
+            if _has_spread(keys[shown]) and len(numbers) > 1:
+                logger.record(f"{shown}_std", float(np.std(numbers)), exclude=excluded)
         self.latest.clear()
+
+    def _shown(self, agent: str, key: str) -> str:
+        """Return the key under which a value of an agent enters the team's table."""
+        group, _, name = key.partition("/")
+        if group != "train" or len(set(self._algorithms.values())) == 1:
+            return key
+        return f"train/{self._algorithms[agent]}/{name}"
 
     def close(self) -> None:
         """Close the files, but not the standard output."""

@@ -1,6 +1,7 @@
 """A team prints one table per iteration, and writes each agent's own values to files."""
 
 import csv
+from functools import partial
 
 import numpy as np
 import pytest
@@ -87,6 +88,66 @@ def test_agents_that_log_at_different_times(tmp_path):
     assert len(rows(tmp_path / "agents" / "agent_0" / "progress.csv")) == len(
         rows(tmp_path / "agents" / "agent_1" / "progress.csv")
     )
+
+
+def test_off_policy_values_survive_episodes_that_end_together(tmp_path):
+    kwargs = {"learning_starts": 2, "train_freq": 1, "policy_kwargs": {"net_arch": [8]}}
+    env = make_team_env(ToyEnv, n_envs=4)
+    team = Team(DQN, "MlpPolicy", env, seed=0, log_dir=str(tmp_path), **kwargs)
+    # The four episodes of a step make four dumps, of which only the first holds what train() has recorded
+    team.learn(84, log_interval=1)
+    own = rows(tmp_path / "agents" / "agent_0" / "progress.csv")
+    assert [row["train/loss"] != "" for row in own] == [True, False, False, False] * 3
+    table = rows(tmp_path / "progress.csv")
+    assert len(table) == 3
+    other = rows(tmp_path / "agents" / "agent_1" / "progress.csv")
+    for i, row in enumerate(table):
+        assert float(row["train/loss"]) == pytest.approx(
+            (float(own[4 * i]["train/loss"]) + float(other[4 * i]["train/loss"])) / 2
+        )
+        # The latest of what each dump holds
+        assert float(row["rollout/ep_rew_mean"]) == pytest.approx(
+            np.mean([float(series[4 * i + 3]["rollout/ep_rew_mean"]) for series in (own, other)])
+        )
+
+
+class LogsBelief(A2C):
+    """Logs a value of which the team's table shows the spread, too."""
+
+    def train(self):
+        super().train()
+        self.logger.record("belief/accuracy", 0.5)
+
+
+def test_one_agent_has_no_spread(tmp_path):
+    classes = {"agent_0": LogsBelief, "agent_1": A2C}
+    Team(classes, "MlpPolicy", make_team_env(ToyEnv), seed=0, log_dir=str(tmp_path)).learn(10)
+    row = rows(tmp_path / "progress.csv")[-1]
+    assert float(row["belief/accuracy"]) == 0.5 and "belief/accuracy_std" not in row
+
+
+def test_different_algorithms_are_not_averaged(tmp_path):
+    classes = {"agent_0": PPO, "agent_1": A2C, "agent_2": PPO}
+    own_kwargs = {agent: {"n_steps": 8, "batch_size": 8} for agent in ("agent_0", "agent_2")} | {"agent_1": {"n_steps": 8}}
+    env = make_team_env(partial(ToyEnv, n_agents=3))
+    Team(classes, "MlpPolicy", env, seed=0, agent_kwargs=own_kwargs, log_dir=str(tmp_path)).learn(24)
+    row = rows(tmp_path / "progress.csv")[-1]
+    own = {agent: rows(tmp_path / "agents" / agent / "progress.csv")[-1] for agent in classes}
+    ppo = [float(own[agent]["train/value_loss"]) for agent in ("agent_0", "agent_2")]
+    assert float(row["train/PPO/value_loss"]) == pytest.approx(np.mean(ppo))
+    assert float(row["train/A2C/value_loss"]) == pytest.approx(float(own["agent_1"]["train/value_loss"]))
+    kl = [float(own[agent]["train/approx_kl"]) for agent in ("agent_0", "agent_2")]
+    assert float(row["train/PPO/approx_kl_std"]) == pytest.approx(np.std(kl), abs=1e-9)
+    assert "train/value_loss" not in row and "rollout/ep_rew_mean" in row
+
+
+def test_long_names_in_the_table(capsys):
+    class AnAlgorithmWithANameOfMoreThanThirtySixLetters(A2C):
+        pass
+
+    classes = {"agent_0": AnAlgorithmWithANameOfMoreThanThirtySixLetters, "agent_1": A2C}
+    Team(classes, "MlpPolicy", make_team_env(ToyEnv), seed=0, verbose=1).learn(10)
+    assert "AnAlgorithmWithANameOfMoreThanThirtySixLetters/value_loss" in capsys.readouterr().out
 
 
 def test_nothing_on_disk_without_a_folder(tmp_path, monkeypatch):
