@@ -23,6 +23,7 @@ from sb3_belief.team.arguments import as_callback, check_agent_keys
 from sb3_belief.team.checkpoint import SavedTeam
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.normalization import AgentNormalize
 from sb3_belief.team.predictor import Predictor
 from sb3_belief.team.sb3_protocol import algorithm_arguments
 
@@ -166,16 +167,19 @@ class AgentModels:
         :raises TypeError: If an algorithm has no argument of a name that is given
         :raises ValueError: If agents are unknown
         """
-        agents = AgentModels(statistics=saved.statistics)
+        statistics: dict[str, VecNormalize] = {
+            agent: AgentNormalize.from_saved(each) for agent, each in saved.statistics.items()
+        }
+        agents = AgentModels(statistics=statistics)
         names = saved.manifest["agents"]
         check_agent_keys("agent_kwargs", options.agent_kwargs, names)
         classes = {agent: saved.algo_class(agent) for agent in names}
         arguments = {agent: options.arguments(agent, algo_class) for agent, algo_class in classes.items()}
         for k, agent in enumerate(names):
             env: VecEnv | None = None if loop is None else loop.agent_envs[agent]
-            if env is not None and agent in saved.statistics:
-                saved.statistics[agent].set_venv(env)
-                env = saved.statistics[agent]
+            if env is not None and agent in statistics:
+                statistics[agent].set_venv(env)
+                env = statistics[agent]
             own_seed = None if seed is None else agent_seed(seed, k)
             if seed != saved.manifest["seed"]:
                 arguments[agent].setdefault("seed", own_seed)
@@ -269,4 +273,4 @@ def normalized(env: VecEnv, normalize: bool | Mapping[str, Any], gamma: float | 
         arguments.setdefault("gamma", gamma)
     if not isinstance(env.observation_space, spaces.Box):
         arguments["norm_obs"] = False
-    return VecNormalize(env, **arguments)
+    return AgentNormalize(env, **arguments)

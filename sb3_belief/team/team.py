@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.common.rng import RngSwitch
 from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, run_learn, team_rng
 from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
-from sb3_belief.team.callbacks import check_agent_callback
+from sb3_belief.team.callbacks import check_agent_callback, warn_of_checkpoints
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
@@ -51,7 +51,7 @@ class Team(SB3Protocol):
     :param env: A ``TeamVecEnv`` (see ``make_team_env``) or SB3 wrappers around one
     :param seed: Seed of the environment and all models; None to leave them unseeded
     :param normalize: True or arguments of ``VecNormalize`` to normalise each agent's observations and rewards by running
-        statistics of its own (an inactive agent's zero observations count too); False not to
+        statistics of its own, in which steps out of play do not count; False not to
     :param verbose: 1 prints one table per iteration, 2 also what the models themselves print
     :param log_dir: Folder of the CSV logs ``progress.csv`` (the team) and ``agents/<agent>/progress.csv``; None for no CSV
         logs
@@ -225,6 +225,7 @@ class Team(SB3Protocol):
             self._can_continue = False
             team_callback = as_callback(callback, progress_bar)
             warn_of_unmasked_evaluation(self._models, team_callback)
+            warn_of_checkpoints(team_callback, bool(self._agents.statistics))
             with self.shown_arguments():
                 progress = TeamProgress(self, team_callback, log)
             with RngSwitch(self._rng):

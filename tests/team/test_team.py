@@ -167,7 +167,7 @@ def test_normalisation_is_each_agents_own():
     team.learn(64)
     statistics = {agent: model.get_vec_normalize_env() for agent, model in team.agents.items()}
     assert all(s.clip_obs == 3.0 and s.gamma == 0.5 for s in statistics.values())
-    assert len({s.obs_rms.mean[0] for s in statistics.values()}) == 3  # "stays" and "last" observe the same
+    assert len({s.obs_rms.mean[0] for s in statistics.values()}) == 4  # All are out of play at other times
     assert statistics["last"].obs_rms.mean[0] == pytest.approx(3.5, abs=0.2)  # The mean of the steps 0 to 7
     assert len({float(s.ret_rms.var) for s in statistics.values()}) == 4
     # Predictions use the statistics without updating them

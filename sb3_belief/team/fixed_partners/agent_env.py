@@ -39,6 +39,9 @@ class AgentEnv(gym.Env):
 
     - an SB3 model; if ``VecNormalize`` normalises its observations, they are normalised here too
     - the path of an SB3 zip, or of a saved team (whose agent of the same name acts; ``"team.zip:agent_0"`` chooses another)
+    - a pair of such a model or path and the ``VecNormalize`` that it has learned in, or the path of the file that
+      ``VecNormalize.save`` wrote (which is unpickled); None for a model that needs none. The zip of a model does not say
+      whether it does; if such a file lies beside it, a warning asks for the pair
     - an object with SB3's ``predict(obs, state, episode_start, deterministic)``
     - a callable ``obs -> action``
 

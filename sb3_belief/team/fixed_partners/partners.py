@@ -4,6 +4,8 @@ import inspect
 import io
 import os
 import pathlib
+import pickle
+import warnings
 import zipfile
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -22,7 +24,11 @@ from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.checkpoint import read_team
 from sb3_belief.team.predictor import PolicyState, Predictor
 
-# The path of a zip, an SB3 model or another object with its ``predict``, or a callable ``obs -> action``
+# That a partner was given no statistics, which is not the same as None
+_UNKNOWN = object()
+
+# The path of a zip, an SB3 model or another object with its ``predict``, a callable ``obs -> action``, or a
+# pair of one of the first two and statistics
 PartnerLike: TypeAlias = Any
 
 # An SB3 zip names its policy but not its algorithm. Where several algorithms have the same policies, one of them can load the
@@ -84,17 +90,25 @@ class Partner:
         self._state: PolicyState = None
         self._new = True
         statistics: VecNormalize | None = None
+        own_statistics: Any = _UNKNOWN
+        if isinstance(given, tuple) and len(given) == 2:
+            given, own_statistics = given
         if isinstance(given, (str, os.PathLike)):
+            if own_statistics is _UNKNOWN:
+                _warn_of_statistics(name, given)
             # Building a network draws random numbers, which must not come from the learner's generators
             with RngSwitch(self.rng):
                 given, statistics = load_model(given, name)
         elif isinstance(given, BaseAlgorithm):
             statistics = given.get_vec_normalize_env()
+        if own_statistics is not _UNKNOWN:
+            statistics = _statistics(name, own_statistics, observation_space)
         self._predictor: Predictor | None = None
         if isinstance(given, type) or not (callable(given) or hasattr(given, "predict")):
             raise TypeError(
                 f"The partner {name!r} is {given!r}; it must be an SB3 model, the path of the zip of one, an object with SB3's"
-                " predict(obs, state, episode_start, deterministic), or a callable obs -> action."
+                " predict(obs, state, episode_start, deterministic), a callable obs -> action, or a pair of a model or path"
+                " and its VecNormalize statistics."
             )
         if hasattr(given, "predict"):
             _check_spaces(name, given, observation_space, action_space)
@@ -180,6 +194,45 @@ def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecN
         f"{file!r} holds a model with the policy {policy_class}, from which its algorithm cannot be told: pass the model"
         f" itself, loaded with its own class, instead of its path. Paths are for {known} and what shares their policies."
     )
+
+
+def _warn_of_statistics(name: str, path: str | os.PathLike) -> None:
+    """Warn if statistics of a ``VecNormalize`` lie beside a model's zip, which does not say that it needs them."""
+    file = pathlib.Path(path)
+    found = sorted(str(beside) for beside in file.parent.glob("*vecnormalize*.pkl"))
+    if found and file.parent.is_dir() and not _is_team(file):
+        warnings.warn(
+            f"The partner {name!r}, {os.fspath(path)!r}, acts on observations as they are, but beside it there is {found}. If"
+            f" it has learned in VecNormalize, give it as the pair ({os.fspath(path)!r}, {found[0]!r}); if not, as"
+            f" ({os.fspath(path)!r}, None)."
+        )
+
+
+def _is_team(file: pathlib.Path) -> bool:
+    path = file if file.exists() else file.with_name(f"{file.name}.zip")
+    return not zipfile.is_zipfile(path) or "team.json" in zipfile.ZipFile(path).namelist()
+
+
+def _statistics(name: str, given: Any, observation_space: spaces.Space) -> VecNormalize | None:
+    """Return the statistics that a partner is given explicitly: those of a file, a ``VecNormalize``, or None for none."""
+    statistics = given
+    if isinstance(given, (str, os.PathLike)):
+        with open(given, "rb") as file:
+            try:
+                statistics = pickle.load(file)
+            except (pickle.UnpicklingError, EOFError):
+                pass
+    if statistics is not None and not isinstance(statistics, VecNormalize):
+        raise TypeError(
+            f"The statistics of the partner {name!r} must be a VecNormalize, the path of a file that VecNormalize.save() has"
+            f" written, or None, got {given!r}."
+        )
+    if statistics is not None and statistics.observation_space.shape != observation_space.shape:
+        raise ValueError(
+            f"The statistics of the partner {name!r} are of the observation space {statistics.observation_space}, but"
+            f" {name!r} has {observation_space} in this environment."
+        )
+    return statistics
 
 
 def _check_spaces(name: str, model: Any, observation_space: spaces.Space, action_space: spaces.Space) -> None:
