@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.team.arguments import check_agent_keys
-from sb3_belief.vec_env.team_vec_env import TeamObs
+from sb3_belief.vec_env.team_vec_env import JointObs, TeamObs
 
 # Recurrent state of a policy, as SB3's predict() takes and returns it
 PolicyState = tuple[np.ndarray, ...] | None
@@ -85,7 +85,7 @@ class TeamPredictor:
 
     def __init__(self, models: Mapping[str, BaseAlgorithm], statistics: Mapping[str, VecNormalize]):
         self._models, self._statistics = models, statistics
-        self._has_warned = False
+        self._has_warned = self._has_warned_of_lives = False
 
     @property
     def takes_masks(self) -> bool:
@@ -96,7 +96,7 @@ class TeamPredictor:
         self,
         observation: Mapping[str, Any],
         state: Mapping[str, PolicyState] | None,
-        episode_start: np.ndarray | None,
+        episode_start: np.ndarray | Mapping[str, np.ndarray] | None,
         deterministic: bool,
         action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None,
     ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
@@ -135,8 +135,28 @@ class TeamPredictor:
                 actions[agent], states[agent] = Predictor(model, self._statistics.get(agent)).predict(
                     observation[agent],
                     states[agent],
-                    episode_start,
+                    None if states[agent] is None else self._starts(agent, observation, episode_start),
                     deterministic,
                     None if action_masks is None else action_masks.get(agent),
                 )
         return actions, states if any(s is not None for s in states.values()) else None
+
+    def _starts(
+        self, agent: str, observation: Mapping[str, Any], episode_start: np.ndarray | Mapping[str, np.ndarray] | None
+    ) -> np.ndarray | None:
+        """Return where an agent's recurrent state starts anew, as in training: where its own return has ended."""
+        if isinstance(episode_start, Mapping):
+            return episode_start.get(agent)
+        if isinstance(observation, JointObs):
+            ends = observation.life_ends(agent)
+            if ends is None or episode_start is None:
+                return ends if episode_start is None else episode_start
+            return ends | np.asarray(episode_start, dtype=bool)
+        if episode_start is not None and not self._has_warned_of_lives:
+            self._has_warned_of_lives = True
+            warnings.warn(
+                "Recurrent agents start anew only with the team's episode here. If lives of single agents end within it, give"
+                " predict() the observations of a TeamVecEnv as they are, which say so (a wrapper or a copy has replaced"
+                " these), or episode_start={agent: bool[n_envs]}."
+            )
+        return episode_start

@@ -251,7 +251,7 @@ class Team(SB3Protocol):
         self,
         observation: TeamObs,
         state: dict[str, PolicyState] | None = None,
-        episode_start: np.ndarray | None = None,
+        episode_start: np.ndarray | Mapping[str, np.ndarray] | None = None,
         deterministic: bool = False,
         action_masks: Mapping[str, np.ndarray] | Sequence[Mapping[str, np.ndarray]] | np.ndarray | None = None,
     ) -> tuple[TeamObs, dict[str, PolicyState] | None]:
@@ -263,7 +263,8 @@ class Team(SB3Protocol):
         :param observation: Observations by agent, ``[n_envs, ...]`` or a single one each, of all agents or some of them;
             normalised here if the team is
         :param state: Recurrent states as returned by the last call, None at first
-        :param episode_start: Where recurrent states start anew, bool ``[n_envs]``
+        :param episode_start: Where recurrent states start anew, bool ``[n_envs]``, for all agents or by agent. For all, they
+            also start anew where an agent's own life has ended, which observations of a ``TeamVecEnv`` say
         :param deterministic: Whether to take the most likely actions instead of samples
         :param action_masks: Masks by agent, bool ``[n_envs, k]``, for models that take masks (``env.action_masks()``); or a
             sequence of each copy's masks, as sb3-contrib's ``MaskableEvalCallback`` and ``evaluate_policy`` pass them on

@@ -4,6 +4,7 @@ import os
 import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -18,6 +19,37 @@ from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
 TeamStep: TypeAlias = tuple[TeamObs, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+class JointObs(dict[str, Any]):
+    """
+    Observations by agent that also know where an agent's own return has just ended.
+
+    SB3's ``evaluate_policy`` hands a model the observations and the dones of the team, and nothing else of a step. A recurrent
+    agent's state has to start anew at each life of its own, as in training, which is known in this way.
+
+    :param obs: The observations, ``[num_envs, ...]`` by agent
+    :param possible_agents: Names of the agents
+    :param infos: Those of the step; none after a reset
+    """
+
+    def __init__(self, obs: TeamObs, possible_agents: Sequence[str], infos: Sequence[Mapping[str, Any]] = ()):
+        super().__init__(obs)
+        self._agents, self._infos = possible_agents, infos
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "JointObs":
+        # SB3's VecTransposeImage copies the observations; the infos need not be
+        return JointObs(deepcopy(dict(self), memo), self._agents, self._infos)
+
+    def life_ends(self, agent: str) -> np.ndarray | None:
+        """
+        Return where the agent's own return has ended or been cut off at the step that led to these observations.
+
+        :param agent: Name of the agent
+        :return: bool ``[num_envs]``; None after a reset
+        """
+        i = self._agents.index(agent)
+        return np.array([info["life_end"][i] or info["truncated"][i] for info in self._infos]) if self._infos else None
 
 
 class TeamVecEnv(VecEnv):
@@ -130,7 +162,7 @@ class TeamVecEnv(VecEnv):
         """
         if self.monitor_dir is not None and not self._writers:
             self.start_monitor(self.monitor_dir)
-        obs = self._reset_joint()
+        obs = JointObs(self._reset_joint(), self.possible_agents)
         # Seeds and options are used only once
         self._reset_seeds()
         self._reset_options()
@@ -155,7 +187,7 @@ class TeamVecEnv(VecEnv):
         """
         obs, rewards, dones, infos = self._step_joint(self._actions)
         self._monitor_step(rewards, dones, infos)
-        return obs, rewards, dones, infos
+        return JointObs(obs, self.possible_agents, infos), rewards, dones, infos
 
     def step(self, actions: TeamObs) -> TeamStep:  # type: ignore[override]
         """
