@@ -19,6 +19,21 @@ def start_context() -> Any:
     return multiprocessing.get_context("forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn")
 
 
+def check_may_have_workers(what: str, instead: str) -> None:
+    """
+    Check that this process may start others.
+
+    :param what: What needs them, for the message
+    :param instead: What needs none
+    :raises ValueError: If it is daemonic, as the workers of ``multiprocessing.Pool`` are
+    """
+    if multiprocessing.current_process().daemon:
+        raise ValueError(
+            f"{what} starts processes, which a daemonic process, such as a worker of multiprocessing.Pool, may not have: use"
+            f" {instead} in it, or start it by concurrent.futures.ProcessPoolExecutor, whose workers may."
+        )
+
+
 def leave_interrupts_to_main() -> None:
     """
     Ignore Ctrl-C in the calling worker process.

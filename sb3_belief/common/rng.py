@@ -1,6 +1,9 @@
 """Random number generators of each agent's own, although SB3 draws from the global ones."""
 
 import random
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch as th
@@ -32,6 +35,19 @@ class RngState:
         self.python = random.Random(seed).getstate()
         self._cuda: list[th.Tensor] = []
 
+    @classmethod
+    def from_global(cls) -> "RngState":
+        """
+        Return a state that the present global generators determine, for whom no seed is given.
+
+        So a caller who seeds them (``set_random_seed(0)``, ``np.random.seed(0)``, ``torch.manual_seed(0)``) repeats a run, as
+        with SB3. Each kind of generator is derived from the global one of its kind, which is advanced by one draw.
+        """
+        state = cls(int(np.random.randint(2**32, dtype=np.uint32)))
+        state._torch = th.Generator().manual_seed(int(th.randint(2**31, (1,)))).get_state()
+        state.python = random.Random(random.getrandbits(32)).getstate()
+        return state
+
     def resume(self) -> None:
         """Make this the current state, from which SB3 draws."""
         th.default_generator.set_state(self._torch)
@@ -58,11 +74,34 @@ class RngState:
         self._torch, self._numpy = other._torch, other._numpy
 
 
+# Held by the thread in which a team's generators are the global ones
+_in_use = threading.RLock()
+
+
+@contextmanager
+def global_rngs_of_this_thread() -> Iterator[None]:
+    """
+    Keep other threads from exchanging the global generators, which all threads share, within the block.
+
+    :raises RuntimeError: If another thread does so already
+    """
+    if not _in_use.acquire(blocking=False):
+        raise RuntimeError(
+            "Another thread of this process is building a team or lets one learn. Both would draw from the process's global"
+            " random number generators, so one would change what the other learns: use a process for each"
+            " (concurrent.futures.ProcessPoolExecutor), or let them learn one after the other."
+        )
+    try:
+        yield
+    finally:
+        _in_use.release()
+
+
 class RngSwitch:
     """
     Context manager in which the global generators switch between several states.
 
-    At its end the caller's own state is restored.
+    At its end the caller's own state is restored. Only one thread can be within such contexts.
 
     Python's generator is slow to exchange and no algorithm of SB3 draws from it. It therefore uses the state of the first
     ``RngState`` throughout, which a team's environments and callbacks share.
@@ -73,8 +112,10 @@ class RngSwitch:
     def __init__(self, rng: RngState):
         self._first = rng
         self._current = rng
+        self._exclusive = global_rngs_of_this_thread()
 
     def __enter__(self) -> "RngSwitch":
+        self._exclusive.__enter__()
         # The caller's numpy generator may keep a normal number for its next call, which the generator object does not hold.
         # Its state is therefore read in full, which is slow but happens only once
         self._callers = RngState(0)
@@ -94,6 +135,7 @@ class RngSwitch:
         bit_generator, state = self._callers_numpy
         mtrand.set_bit_generator(bit_generator)
         np.random.set_state(state)
+        self._exclusive.__exit__(None, None, None)
 
     def to(self, rng: RngState) -> None:
         """

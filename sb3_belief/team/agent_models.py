@@ -96,7 +96,16 @@ def team_rng(seed: int | None) -> RngState:
 
     :param seed: The team's seed, or None
     """
-    return RngState(None if seed is None else int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    return rng_state(None if seed is None else int(np.random.SeedSequence(seed).generate_state(1)[0]))
+
+
+def rng_state(seed: int | None) -> RngState:
+    """
+    Return random number generators.
+
+    :param seed: Their seed. None to derive them from the global ones, which the caller may have seeded
+    """
+    return RngState.from_global() if seed is None else RngState(seed)
 
 
 @dataclass
@@ -145,7 +154,7 @@ class AgentModels:
             env: VecEnv = loop.agent_envs[agent]
             if normalize is not False:
                 env = agents.statistics[agent] = normalized(env, normalize, arguments.get("gamma"))
-            agents.rngs[agent] = RngState(own_seed)
+            agents.rngs[agent] = rng_state(own_seed)
             with RngSwitch(agents.rngs[agent]):
                 try:
                     agents.models[agent] = algo_class(spec.policy, env, **arguments)
@@ -183,7 +192,7 @@ class AgentModels:
             own_seed = None if seed is None else agent_seed(seed, k)
             if seed != saved.manifest["seed"]:
                 arguments[agent].setdefault("seed", own_seed)
-            agents.rngs[agent] = RngState(own_seed)
+            agents.rngs[agent] = rng_state(own_seed)
             with RngSwitch(agents.rngs[agent]):
                 agents.models[agent] = classes[agent].load(
                     io.BytesIO(saved.models[agent]),

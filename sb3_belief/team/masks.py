@@ -4,13 +4,10 @@ import warnings
 from collections.abc import Mapping
 
 import numpy as np
-from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
 from sb3_belief.belief_ppo import BeliefPPO
-from sb3_belief.team.callbacks import callbacks_within
 from sb3_belief.team.predictor import takes_masks
 
 EVALUATION = (
@@ -37,22 +34,6 @@ def warn_of_unmasked_models(models: Mapping[str, BaseAlgorithm], masks: Mapping[
             f"The environment gives action masks to {concerned}, and {' and '.join(classes)} takes none: impossible actions"
             f" are chosen, too. Use {' and '.join(instead)}; {EVALUATION}."
         )
-
-
-def warn_of_unmasked_evaluation(models: Mapping[str, BaseAlgorithm], callback: BaseCallback) -> None:
-    """
-    Warn of evaluations in which models act without the masks that they are trained with.
-
-    :param models: The models that the callback evaluates, by agent
-    :param callback: Of the team, or of a single agent
-    """
-    masked = [agent for agent, model in models.items() if takes_masks(model)]
-    for each in callbacks_within(callback):
-        if masked and isinstance(each, EvalCallback) and not isinstance(each, MaskableEvalCallback):
-            warnings.warn(
-                f"{type(each).__name__} evaluates without action masks, and so {masked} with other actions than in training:"
-                " use MaskableEvalCallback (sb3_contrib.common.maskable.callbacks)."
-            )
 
 
 def _masked_class(model: BaseAlgorithm) -> str:

@@ -4,7 +4,8 @@ import io
 import os
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -16,14 +17,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_belief.common.rng import RngSwitch
+from sb3_belief.common.rng import RngSwitch, global_rngs_of_this_thread
 from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, run_learn, team_rng
 from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
-from sb3_belief.team.callbacks import check_agent_callback, warn_of_checkpoints
+from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
-from sb3_belief.team.masks import warn_of_unmasked_evaluation, warn_of_unmasked_models
+from sb3_belief.team.masks import warn_of_unmasked_models
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
 from sb3_belief.team.sb3_protocol import SB3Protocol
@@ -49,7 +50,8 @@ class Team(SB3Protocol):
     :param algo_class: Class of SB3, sb3-contrib or this package for all agents, or a dict of one for each agent
     :param policy: Policy of that class for all agents, or a dict of one for each agent
     :param env: A ``TeamVecEnv`` (see ``make_team_env``) or SB3 wrappers around one
-    :param seed: Seed of the environment and all models; None to leave them unseeded
+    :param seed: Seed of the environment and all models; None to leave the environment unseeded and have the models' random
+        numbers follow from the global generators, which ``set_random_seed(s)`` of SB3 seeds
     :param normalize: True or arguments of ``VecNormalize`` to normalise each agent's observations and rewards by running
         statistics of its own, in which steps out of play do not count; False not to
     :param verbose: 1 prints one table per iteration, 2 also what the models themselves print
@@ -190,7 +192,7 @@ class Team(SB3Protocol):
         :param progress_bar: Whether to show SB3's progress bar
         :param agent_callbacks: Callbacks of single agents by agent, each with the agent's model as its model
         :return: The team
-        :raises RuntimeError: If the team is learning already
+        :raises RuntimeError: If the team is learning already, or if another does in another thread
         :raises ValueError: If it has no environment, if agents are unknown, if the run has another name already, if something
             was set on the team that belongs to its models, or if the ``EvalCallback`` of an agent has another's environment
         """
@@ -200,14 +202,11 @@ class Team(SB3Protocol):
         if loop is None:
             raise ValueError("This team has no environment to learn in: use set_env(), or Team.load(path, env=env).")
         own_callbacks = agent_callbacks or {}
-        check_agent_keys("agent_callbacks", own_callbacks, self.possible_agents)
-        for agent, own in own_callbacks.items():
-            check_agent_callback(agent, self._models[agent], as_callback(own))
-            warn_of_unmasked_evaluation({agent: self._models[agent]}, as_callback(own))
+        team_callback = as_callback(callback, progress_bar)
+        check_callbacks(self._models, bool(self._agents.statistics), team_callback, own_callbacks)
         self.check_nothing_set()
-        log = self._make_log(tb_log_name)
-        self._learning = True
-        try:
+        with self._exclusively():
+            log = self._make_log(tb_log_name)
             if reset_num_timesteps:
                 self.num_timesteps = 0
                 self._iterations = 0
@@ -223,9 +222,6 @@ class Team(SB3Protocol):
             tasks = self._agents.tasks(learn, own_callbacks)
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
-            team_callback = as_callback(callback, progress_bar)
-            warn_of_unmasked_evaluation(self._models, team_callback)
-            warn_of_checkpoints(team_callback, bool(self._agents.statistics))
             with self.shown_arguments():
                 progress = TeamProgress(self, team_callback, log)
             with RngSwitch(self._rng):
@@ -243,9 +239,16 @@ class Team(SB3Protocol):
             with RngSwitch(self._rng):
                 progress.on_training_end()
             self._can_continue = in_step
-        finally:
-            self._learning = False
         return self
+
+    @contextmanager
+    def _exclusively(self) -> Iterator[None]:
+        with global_rngs_of_this_thread():
+            self._learning = True
+            try:
+                yield
+            finally:
+                self._learning = False
 
     def predict(
         self,

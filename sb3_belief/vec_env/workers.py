@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
-from sb3_belief.common.processes import Inbox, leave_interrupts_to_main, start_context
+from sb3_belief.common.processes import Inbox, check_may_have_workers, leave_interrupts_to_main, start_context
 from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
 
 # Messages with a step's actions begin with this byte; all other messages are pickles, which begin with another one
@@ -73,6 +73,7 @@ class WorkersVecEnv(SubprocVecEnv):
     action_masks: np.ndarray | None = None
 
     def __init__(self, env_fns: list[Callable[[], JointEnv]]):
+        check_may_have_workers('vec_env="subproc"', 'vec_env="dummy"')
         self.waiting = self.closed = False
         # SB3's constructor is not called, because it would start its own function in the workers. Otherwise this does the same
         context = start_context()

@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_belief.common.processes import check_may_have_workers
 from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.joint_loop import JointLoop
@@ -36,10 +37,12 @@ def check_jobs(jobs: Any) -> int:
 
     :param jobs: What the user gave
     :return: The same
-    :raises ValueError: If it is not a whole number of at least 1
+    :raises ValueError: If it is not a whole number of at least 1, or if this process may not start others
     """
     if not isinstance(jobs, int) or isinstance(jobs, bool) or jobs < 1:
         raise ValueError(f"jobs is {jobs!r}; it must be a whole number of at least 1: the processes that work for the agents.")
+    if jobs > 1:
+        check_may_have_workers(f"jobs={jobs}", "jobs=1")
     return jobs
 
 
