@@ -27,8 +27,8 @@ def make_team_env(
     :param env: An id (``"traffic-junction-medium"``, ``"mpe/simple_spread_v3"``, ``"module:callable"``; the command
         ``sb3-belief envs`` lists them), or a callable (class or function) that returns a new PettingZoo ``ParallelEnv``
     :param n_envs: Number of environment copies, at least 1
-    :param seed: Copy i is seeded with ``seed + i`` at its first reset. With None the copies are unseeded (a ``Team`` with a
-        seed then seeds them)
+    :param seed: Copy i is seeded with ``seed + i`` at its first reset. With None the copies are unseeded. A ``Team`` with a
+        seed seeds them anew
     :param vec_env: ``"dummy"`` steps the copies in this process, all at once where the environment has a batched class.
         ``"subproc"`` runs each copy in a worker process of its own. Workers import the calling script, which therefore needs
         ``if __name__ == "__main__":``

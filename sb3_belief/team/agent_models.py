@@ -90,6 +90,21 @@ def agent_seed(seed: int, index: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0])
 
 
+def env_seed(seed: int, purpose: int = 0) -> int:
+    """
+    Return the seed of a team's environment, whose copy i then has this seed + i, as in SB3.
+
+    SB3 itself gives copy i the seed s + i, so that runs with neighbouring seeds s play nearly the same episodes. These are far
+    apart.
+
+    :param seed: The team's seed
+    :param purpose: 0 for training, 1 for an environment of evaluations that is to have other episodes
+    :return: The environment's seed, in [0, 2**30)
+    """
+    # Spawn keys of two numbers, since those of the agents have one
+    return int(np.random.SeedSequence(seed, spawn_key=(0, purpose)).generate_state(1)[0] >> 2)
+
+
 def team_rng(seed: int | None) -> RngState:
     """
     Return the random number generators of the environment in this process and of the team's callbacks.

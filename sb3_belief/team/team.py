@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.rng import RngSwitch, global_rngs_of_this_thread
-from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, run_learn, team_rng
+from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, env_seed, run_learn, team_rng
 from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
 from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
@@ -38,9 +38,9 @@ class Team(SB3Protocol):
     One SB3 model for each agent of a team, all learning at once in one vectorised environment.
 
     The models are unmodified SB3 ones and share nothing: weights, buffers, normalisation, loggers and random number generators
-    are each agent's own. With ``seed=s`` the environment is seeded with ``s`` as SB3 models do it, and agent k's model with
-    ``agent_seed(s, k)``, so that equal networks start differently and no agent's learning depends on how many random numbers
-    another draws. Policies of equal shape make their forward passes in one batch, with the same result to the bit. One
+    are each agent's own. With ``seed=s`` the environment is seeded with ``env_seed(s)``, so that runs with neighbouring seeds
+    play different episodes, and agent k's model with ``agent_seed(s, k)``, so that equal networks start differently and no
+    agent's learning depends on how many random numbers another draws. Policies of equal shape make their forward passes in one batch, with the same result to the bit. One
     timestep is one joint step of one copy of the environment.
 
     ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps``, ``logger`` and more are those of
@@ -97,7 +97,7 @@ class Team(SB3Protocol):
         agents = AgentModels.build(specs, loop, seed, normalize, max(verbose - 1, 0), device)
         self._setup(loop, agents, loop.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
         if seed is not None:
-            env.seed(seed)
+            env.seed(env_seed(seed))
 
     def _setup(
         self,
@@ -347,7 +347,7 @@ class Team(SB3Protocol):
         team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
         team.num_timesteps = manifest["num_timesteps"]
         if env is not None and seed is not None:
-            env.seed(seed)
+            env.seed(env_seed(seed))
         return team
 
     def get_env(self) -> VecEnv | None:

@@ -15,6 +15,7 @@ from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
+from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.preflight import check_copies, check_device, check_folder, check_memory
@@ -30,9 +31,6 @@ from sb3_belief.zoo.run_folder import (
     remove_run_folder,
 )
 from sb3_belief.zoo.trust import check_saved_team
-
-# Added to the seed of the evaluation environment, so that its copies get other seeds than those of the training
-EVAL_SEED_OFFSET = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         eval_env = None
         if options.eval_freq > 0:
             eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
-            eval_env = make_env(eval_config, options.n_eval_envs, seed + EVAL_SEED_OFFSET, "dummy")
+            eval_env = make_env(eval_config, options.n_eval_envs, env_seed(seed, purpose=1), "dummy")
             stack.callback(eval_env.close)
         # The team opens its logs in the folder, so the folder must exist first. It is removed again if the team is refused
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
@@ -278,7 +276,7 @@ def _load_team(config: RunConfig, trained: Path, env: TeamVecEnv, seed: int, com
                 f"--trained-agent: {agent!r} in {str(trained)!r} is a {type(model).__name__}, not a {expected.__name__}."
             )
     # Loading seeds the environment as in the run before. With this run's own seed it does not repeat the same episodes
-    env.seed(seed)
+    env.seed(env_seed(seed))
     return team
 
 

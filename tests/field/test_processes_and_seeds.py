@@ -11,6 +11,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 
+from sb3_belief.team.agent_models import env_seed
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import ToyEnv
 
@@ -64,6 +65,30 @@ def test_a_seeded_team_neither_reads_nor_moves_the_global_generators():
         set_random_seed(seed)
         assert states[-1] == (float(np.random.rand()), float(th.rand(())))
     assert th.equal(*runs)
+
+
+def test_neighbouring_seeds_have_no_episodes_in_common(tmp_path):
+    def first(team):
+        obs = team.get_env().reset()
+        return {tuple(row) for row in obs["agent_0"].tolist()}
+
+    def make(seed):
+        return Team(PPO, "MlpPolicy", make_team_env(ToyEnv, n_envs=8), seed=seed, **PPO_KWARGS)
+
+    rows = [first(make(seed)) for seed in (0, 1, 2)]
+    assert all(len(each) == 8 for each in rows) and len(set.union(*rows)) == 24
+    assert first(make(1)) == rows[1]
+    make(1).save(tmp_path / "team")
+    assert first(Team.load(tmp_path / "team", env=make_team_env(ToyEnv, n_envs=8))) == rows[1]
+    # Evaluations have others; a thousand seeds and their copies do not meet
+    starts = sorted(env_seed(seed, purpose) for seed in range(1000) for purpose in (0, 1))
+    assert min(np.diff(starts)) > 64 and starts[0] >= 0 and starts[-1] < 2**30
+    # By hand it is SB3's rule, also after the team was made
+    team = make(0)
+    team.get_env().seed(5)
+    by_hand = [make_team_env(ToyEnv, n_envs=8, seed=seed).reset()["agent_0"] for seed in (5, 6)]
+    assert first(team) == {tuple(row) for row in by_hand[0].tolist()}
+    assert np.array_equal(by_hand[0][1:], by_hand[1][:-1])
 
 
 def in_thread(call):

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_belief.team.agent_models import agent_seed
+from sb3_belief.team.agent_models import agent_seed, env_seed
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv
 
@@ -36,8 +36,8 @@ def test_seeds():
     assert th.equal(parameters(team.agents["agent_1"]), parameters(same.agents["agent_1"]))
     assert not th.equal(parameters(team.agents["agent_1"]), parameters(team.agents["agent_0"]))
     assert not th.equal(parameters(team.agents["agent_1"]), parameters(other.agents["agent_1"]))
-    # The environment is given the team's seed
-    env = make_team_env(ToyEnv, n_envs=2, seed=0)
+    # The environment is given a seed that follows from the team's
+    env = make_team_env(ToyEnv, n_envs=2, seed=env_seed(0))
     assert np.array_equal(team.get_env().reset()["agent_1"], env.reset()["agent_1"])
     unseeded = [make_team(seed=None) for _ in range(2)]
     assert not th.equal(*(parameters(team.agents["agent_0"]) for team in unseeded))

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_belief import MaskableBeliefPPO
-from sb3_belief.team.agent_models import agent_seed
+from sb3_belief.team.agent_models import agent_seed, env_seed
 from sb3_belief.zoo.evaluate import evaluate
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.toy_envs import MaskedEnv, MixedEnv, ScriptedEnv, ToyEnv, ToySolo
@@ -52,7 +52,7 @@ def test_an_agent_learns_what_it_would_learn_alone(algo, kwargs):
     alone_env = DummyVecEnv([partial(ToySolo, index=1)] * 2)
     alone = algo("MlpPolicy", alone_env, seed=agent_seed(seed, 1), **{"device": "cpu", **kwargs})
     untrained = parameters(alone)
-    alone_env.seed(seed)
+    alone_env.seed(env_seed(seed))
     alone.learn(80)
     assert not th.equal(untrained, parameters(alone))
     assert all(th.equal(parameters(alone), run) for run in runs)
