@@ -1,39 +1,92 @@
-"""Warnings about action masks that an environment gives and nobody uses."""
+"""A warning of models that take no action masks in an environment that gives some."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.belief_ppo import BeliefPPO
+from sb3_belief.common.exceptions import add_note
 from sb3_belief.team.predictor import takes_masks
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
-EVALUATION = (
-    "sb3-contrib's evaluate_policy (sb3_contrib.common.maskable.evaluation) and MaskableEvalCallback"
-    " (sb3_contrib.common.maskable.callbacks) pass masks on"
-)
+# An agent that is not masked chooses what is impossible within its first random actions, or hardly ever
+N_STEPS = 200
 
 
-def warn_of_unmasked_models(models: Mapping[str, BaseAlgorithm], masks: Mapping[str, np.ndarray] | None) -> None:
+class MaskCheck:
     """
-    Warn of models that will choose impossible actions, since their algorithm takes no masks.
+    Watches whether agents without masks choose impossible actions while they are in play, in the first joint steps.
+
+    A mask that only says what an agent may do while it is out of play concerns nobody, so the masks alone do not tell.
 
     :param models: The models by agent
     :param masks: The masks after a reset by agent, bool ``[n_envs, k]``; None without masks
     """
-    unmasked = [agent for agent in masks or {} if not takes_masks(models[agent])]
-    # An agent that has been given no mask of its own has one that allows everything; at first all others' may, too
-    restricted = [agent for agent, mask in (masks or {}).items() if not mask.all()]
-    concerned = [agent for agent in unmasked if agent in restricted or not restricted]
-    if concerned:
-        classes = sorted({type(models[agent]).__name__ for agent in concerned})
-        instead = sorted({_masked_class(models[agent]) for agent in concerned})
-        warnings.warn(
-            f"The environment gives action masks to {concerned}, and {' and '.join(classes)} takes none: impossible actions"
-            f" are chosen, too. Use {' and '.join(instead)}; {EVALUATION}."
+
+    def __init__(self, models: Mapping[str, BaseAlgorithm], masks: Mapping[str, np.ndarray] | None):
+        self._models = {agent: models[agent] for agent in masks or {} if not takes_masks(models[agent])}
+        self._agents = list(models)
+        self._n_steps = 0
+        #: Whether there is nothing to watch any more
+        self.is_done = not self._models
+
+    def step(self, env_step: Callable[[Any], Any], actions: TeamObs, masks: Mapping[str, np.ndarray] | None) -> TeamStep:
+        """
+        Step the environment, and warn if an agent in play has chosen an impossible action.
+
+        :param env_step: Steps the environment
+        :param actions: The actions by agent, ``[n_envs, ...]``
+        :param masks: The masks of these actions by agent
+        :return: The step
+        :raises Exception: What the environment raises, with a note if an action is impossible
+        """
+        impossible = {
+            agent: ~_possible(model.action_space, actions[agent], masks[agent])
+            for agent, model in self._models.items()
+            if masks is not None and agent in masks
+        }
+        try:
+            step: TeamStep = env_step(actions)
+        except Exception as error:
+            concerned = [agent for agent, where in impossible.items() if where.any()]
+            if concerned:
+                add_note(error, self._message(concerned))
+            raise
+        active = np.array([info["active"] for info in step[3]])
+        concerned = [agent for agent, where in impossible.items() if (where & active[:, self._agents.index(agent)]).any()]
+        if concerned:
+            warnings.warn(self._message(concerned))
+        self._n_steps += 1
+        self.is_done = bool(concerned) or self._n_steps == N_STEPS
+        return step
+
+    def _message(self, concerned: list[str]) -> str:
+        classes = sorted({type(self._models[agent]).__name__ for agent in concerned})
+        instead = sorted({_masked_class(self._models[agent]) for agent in concerned})
+        return (
+            f"The action masks of {concerned} are not heeded: {' and '.join(classes)} takes none and chooses impossible"
+            f" actions, too. Use {' and '.join(instead)}; sb3-contrib's evaluate_policy (sb3_contrib.common.maskable.evaluation) and"
+            " MaskableEvalCallback (sb3_contrib.common.maskable.callbacks) pass masks on."
         )
+
+
+def _possible(space: spaces.Space, actions: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """Return whether masks allow actions, bool ``[n_envs]``."""
+    if isinstance(space, spaces.Discrete):
+        widths, chosen = [int(space.n)], actions - space.start
+    elif isinstance(space, spaces.MultiDiscrete):
+        widths, chosen = space.nvec.ravel().tolist(), actions - space.start
+    else:
+        # MultiBinary has the flags of 0 and 1 for each number
+        widths, chosen = [2] * actions[0].size, actions
+    offsets = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(int)
+    allowed = np.take_along_axis(masks, chosen.reshape(len(masks), -1).astype(int) + offsets, axis=1)
+    return np.logical_and.reduce(allowed, axis=1)
 
 
 def _masked_class(model: BaseAlgorithm) -> str:

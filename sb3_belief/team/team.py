@@ -24,7 +24,7 @@ from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
-from sb3_belief.team.masks import warn_of_unmasked_models
+from sb3_belief.team.masks import MaskCheck
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
 from sb3_belief.team.sb3_protocol import SB3Protocol
@@ -40,8 +40,8 @@ class Team(SB3Protocol):
     The models are unmodified SB3 ones and share nothing: weights, buffers, normalisation, loggers and random number generators
     are each agent's own. With ``seed=s`` the environment is seeded with ``env_seed(s)``, so that runs with neighbouring seeds
     play different episodes, and agent k's model with ``agent_seed(s, k)``, so that equal networks start differently and no
-    agent's learning depends on how many random numbers another draws. Policies of equal shape make their forward passes in one batch, with the same result to the bit. One
-    timestep is one joint step of one copy of the environment.
+    agent's learning depends on how many random numbers another draws. Policies of equal shape make their forward passes in
+    one batch, with the same result to the bit. One timestep is one joint step of one copy of the environment.
 
     ``learn``, ``predict``, ``save``, ``load``, ``set_env``, ``get_env``, ``num_timesteps``, ``logger`` and more are those of
     an SB3 model, so ``evaluate_policy`` and SB3's callbacks take a team as it is. What all agents have in common is read like
@@ -229,11 +229,11 @@ class Team(SB3Protocol):
                     for model in self.agents.values():
                         model._last_obs = None
                     loop.reset()
-                    warn_of_unmasked_models(self._models, loop.masks)
                 total = total_timesteps + self.num_timesteps
                 progress.on_training_start(
                     {"self": self, "total_timesteps": total, "tb_log_name": log.run_name, "env": loop.env}
                 )
+            loop.mask_check = MaskCheck(self._models, loop.masks)
             with self._parallel.distribute(loop, tasks, learn, team_callback) as groups:
                 in_step = loop.run(tasks, progress, self._rng, groups)
             with RngSwitch(self._rng):

@@ -15,8 +15,9 @@ from stable_baselines3.common.callbacks import CallbackList, EvalCallback, Every
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.team.masks import _possible
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
-from tests.team.toy_envs import ToyEnv
+from tests.team.toy_envs import MaskedEnv, ToyEnv
 
 KWARGS = {**PPO_KWARGS, "n_steps": 16, "batch_size": 16}
 
@@ -56,29 +57,56 @@ def masked_team(**kwargs):
 @pytest.mark.parametrize(
     "algorithm, policy, kwargs, instead",
     [
-        (PPO, "MlpPolicy", KWARGS, "PPO takes none: .* Use MaskablePPO;"),
-        (BeliefPPO, "BeliefPolicy", {**KWARGS, "belief": "none"}, "BeliefPPO takes none: .* Use MaskableBeliefPPO;"),
-        (A2C, "MlpPolicy", {}, "A2C takes none: .* Use MaskablePPO or MaskableBeliefPPO;"),
+        (PPO, "MlpPolicy", KWARGS, "PPO takes none and .* Use MaskablePPO;"),
+        (BeliefPPO, "BeliefPolicy", {**KWARGS, "belief": "none"}, "BeliefPPO takes none and .* Use MaskableBeliefPPO;"),
+        (A2C, "MlpPolicy", {}, "A2C takes none and .* Use MaskablePPO or MaskableBeliefPPO;"),
     ],
 )
 @pytest.mark.parametrize("env", [Lenient, MultiDiscrete])
 def test_an_algorithm_without_masks(algorithm, policy, kwargs, instead, env):
     team = Team(algorithm, policy, make_team_env(env, n_envs=2), seed=0, **kwargs)
-    with pytest.warns(
-        UserWarning, match=rf"gives action masks to \['agent_0', 'agent_1'\], and {instead}.*MaskableEvalCallback"
-    ):
+    with pytest.warns(UserWarning, match=rf"action masks of \['agent_.*\] are not heeded: {instead}.*MaskableEvalCallback"):
         team.learn(32)
 
 
 def test_only_those_who_are_given_masks_are_named():
     classes = {"agent_0": PPO, "agent_1": MaskablePPO}
     team = Team(classes, "MlpPolicy", make_team_env(Lenient), seed=0, **KWARGS)
-    with pytest.warns(UserWarning, match=r"gives action masks to \['agent_0'\]"):
+    with pytest.warns(UserWarning, match=r"action masks of \['agent_0'\] are not heeded"):
         team.learn(16)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Team(classes, "MlpPolicy", make_team_env(partial(Lenient, but=["agent_0"])), seed=0, **KWARGS).learn(16)
         Team(PPO, "MlpPolicy", make_team_env(ToyEnv), seed=0, **KWARGS).learn(16)
+
+
+def test_masks_of_those_out_of_play_concern_nobody():
+    """In Traffic Junction only slots without a car are masked."""
+    env = make_team_env("traffic-junction-easy", n_envs=2, env_kwargs={"arrival_rate": 0.3})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Team(PPO, "MlpPolicy", env, seed=0, **KWARGS).learn(64)
+
+
+def test_an_environment_that_refuses_what_is_impossible():
+    team = Team(PPO, "MlpPolicy", make_team_env(MaskedEnv), seed=0, **KWARGS)
+    with pytest.raises(ValueError, match=r"agent_0 did \d at step") as caught:
+        team.learn(32)
+    assert "Use MaskablePPO;" in "".join(getattr(caught.value, "__notes__", []))
+
+
+@pytest.mark.parametrize(
+    "space, actions, masks",
+    [
+        (spaces.Discrete(3), [0, 2], [[1, 0, 0], [1, 1, 0]]),
+        (spaces.Discrete(3, start=5), [5, 7], [[1, 0, 0], [1, 1, 0]]),
+        (spaces.MultiDiscrete([2, 3]), [[1, 2], [1, 2]], [[0, 1, 0, 0, 1], [1, 0, 1, 1, 1]]),
+        (spaces.MultiDiscrete(np.array([[2], [3]])), [[[1], [2]], [[1], [2]]], [[0, 1, 0, 0, 1], [0, 1, 1, 1, 0]]),
+        (spaces.MultiBinary(2), [[1, 0], [0, 0]], [[0, 1, 1, 0], [1, 1, 0, 1]]),
+    ],
+)
+def test_what_a_mask_allows(space, actions, masks):
+    assert _possible(space, np.array(actions), np.array(masks, dtype=bool)).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("kind", [MaskablePPO, MaskableBeliefPPO])

@@ -37,6 +37,7 @@ from sb3_belief.team.lockstep.scheduler import (
 )
 from sb3_belief.team.lockstep.wrapper_check import WrapperCheck
 from sb3_belief.team.logs import TeamLog
+from sb3_belief.team.masks import MaskCheck
 from sb3_belief.vec_env.agent_vec_env import AgentTransition, TransitionSplitter
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
@@ -193,6 +194,8 @@ class JointLoop(Scheduler):
         self.possible_agents = list(team_env.possible_agents)
         self._team_env = team_env
         self._wrapper_check = WrapperCheck(env)
+        #: Watches the first steps for actions that masks forbid
+        self.mask_check: MaskCheck | None = None
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
         self._groups: Sequence[AgentGroup] = ()
@@ -356,7 +359,10 @@ class JointLoop(Scheduler):
     def _step(self, actions: TeamObs) -> TeamStep:
         self.n_steps += 1
         self._continues = True
-        step: TeamStep = self.env.step(actions)  # type: ignore[arg-type, assignment]
+        if self.mask_check is None or self.mask_check.is_done:
+            step: TeamStep = self.env.step(actions)  # type: ignore[arg-type, assignment]
+        else:
+            step = self.mask_check.step(self.env.step, actions, self.masks)
         if self._wrapper_check.wrappers:
             self._wrapper_check.check(step)
         self._masks_known = False
