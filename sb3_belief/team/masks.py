@@ -70,8 +70,9 @@ class MaskCheck:
         instead = sorted({_masked_class(self._models[agent]) for agent in concerned})
         return (
             f"The action masks of {concerned} are not heeded: {' and '.join(classes)} takes none and chooses impossible"
-            f" actions, too. Use {' and '.join(instead)}; sb3-contrib's evaluate_policy (sb3_contrib.common.maskable.evaluation) and"
-            " MaskableEvalCallback (sb3_contrib.common.maskable.callbacks) pass masks on."
+            f" actions, too. Use {' and '.join(instead)}, and for evaluation sb3-contrib's evaluate_policy"
+            " (sb3_contrib.common.maskable.evaluation) and MaskableEvalCallback (sb3_contrib.common.maskable.callbacks), which"
+            " pass masks on."
         )
 
 
