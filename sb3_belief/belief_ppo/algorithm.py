@@ -19,7 +19,8 @@ from sb3_belief.belief import n_selected
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.extractor import fitting_extractor
-from sb3_belief.belief_ppo.options import LATENT_DIM, BeliefOptions
+from sb3_belief.belief_ppo.memory import holds_images, warn_of_memory
+from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
@@ -55,10 +56,14 @@ class BeliefAlgorithmMixin(_Algorithm):
     policy_latent: str
     similarity: str
     detach_belief: bool
+    #: Whether the belief sees features unless policy_kwargs say otherwise. Models saved before it could do not
+    belief_from_features: bool
     action_coef: float | Schedule
     kl_coef: float | Schedule
 
-    def _setup_belief(self, options: BeliefOptions, action_coef: float | Schedule, kl_coef: float | Schedule) -> None:
+    def _setup_belief(
+        self, options: BeliefOptions, action_coef: float | Schedule, kl_coef: float | Schedule, is_new: bool
+    ) -> None:
         """Check and store the belief's arguments, between SB3's constructor and `_setup_model`."""
         for name, value in asdict(options).items():
             setattr(self, name, value)
@@ -69,6 +74,8 @@ class BeliefAlgorithmMixin(_Algorithm):
                 raise ValueError(f"{name} is {coefficient!r}; the weight of a loss must be at least 0")
         self.action_coef = action_coef if callable(action_coef) else float(action_coef)
         self.kl_coef = kl_coef if callable(kl_coef) else float(kl_coef)
+        # A saved model that is loaded brings its own value, unless it is from before there was one
+        self.belief_from_features = is_new and self.env is not None and holds_images(self.observation_space)
         # An agent without a belief may meet any others
         self.others_action_spaces = {} if self.env is None or options.variant is None else others_of(self.env)
 
@@ -105,8 +112,10 @@ class BeliefAlgorithmMixin(_Algorithm):
                 f"rollout_buffer_class is {self.rollout_buffer_class.__name__}, which has no place for what a belief is "
                 f"trained on; derive it from sb3_belief.belief_ppo.{plain.__name__} (or {for_dicts.__name__})"
             )
+        self._warn_of_memory()
         if issubclass(self.policy_class, self.policy_base):
             self.policy_kwargs = {
+                "belief_from_features": self.belief_from_features,
                 **self.policy_kwargs,
                 "others_action_spaces": self.others_action_spaces,
                 **asdict(self._options),
@@ -119,6 +128,14 @@ class BeliefAlgorithmMixin(_Algorithm):
             self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs = user_kwargs
         # As SB3 does with its own coefficients that may be schedules
         self.action_coef, self.kl_coef = FloatSchedule(self.action_coef), FloatSchedule(self.kl_coef)
+
+    def _warn_of_memory(self) -> None:
+        sees_all = not self.policy_kwargs.get("belief_from_features", self.belief_from_features)
+        variant = self._options.variant if self.others_action_spaces else None
+        attends = variant is not None and variant.attends
+        rows = self.history_length if attends and sees_all else 0
+        width = self.policy_kwargs.get("embedding_dim", EMBEDDING_DIM)
+        warn_of_memory(self.observation_space, self.n_steps, self.n_envs, rows, width)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "") -> None:
         # SB3 recognises policies without convolutions by the names of their classes

@@ -53,8 +53,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param target_kl: As in PPO
     :param stats_window_size: As in PPO
     :param tensorboard_log: As in PPO
-    :param policy_kwargs: As in PPO, and ``embedding_dim``, ``latent_dim``, ``fusion_activation_fn`` of
-        :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin`
+    :param policy_kwargs: As in PPO, and ``embedding_dim``, ``latent_dim``, ``fusion_activation_fn``, ``belief_from_features``
+        (by default True for images) of :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin`
     :param verbose: As in PPO
     :param seed: As in PPO
     :param device: As in PPO
@@ -157,7 +157,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             _init_setup_model=False,
         )
         options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
-        self._setup_belief(options, action_coef, kl_coef)
+        self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()
 

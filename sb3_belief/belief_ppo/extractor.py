@@ -108,6 +108,7 @@ class BeliefExtractor(BaseFeaturesExtractor):
     :param features: Extractor of the features of the observation itself
     :param belief: The belief network
     :param options: The user's options of the belief
+    :param from_features: Whether belief and history see these features instead of the observation itself
     """
 
     #: Whether features and belief are returned in one tensor
@@ -123,11 +124,13 @@ class BeliefExtractor(BaseFeaturesExtractor):
         features: BaseFeaturesExtractor,
         belief: DynamicBelief,
         options: BeliefOptions,
+        from_features: bool = False,
     ) -> None:
         super().__init__(observation_space, features.features_dim + belief.latent_dim)
         self.features = features
         self.belief = belief
         self.options = options
+        self.from_features = from_features
         if belief.variant.attends:
             history = empty_history(options.history_length, belief.observation_dim, belief.action_dim)
             for name, rows in history._asdict().items():
@@ -168,13 +171,14 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :return: Features and belief, as of :meth:`with_belief`
         """
         belief_pass = belief_pass or BeliefPass()
-        flat = flatten_observation(observations)
+        own = self.features(observations)
+        flat = own if self.from_features else flatten_observation(observations)
         if belief_pass.sample:
             belief_pass.noise = self.draw_noise(flat)
         # While acting, no prediction is needed
         output = self.infer(flat, belief_pass.noise, belief_pass.selected, predict=th.is_grad_enabled())
         belief_pass.output = output
-        return self.with_belief(self.features(observations), output)
+        return self.with_belief(own, output)
 
     def draw_noise(self, flat: th.Tensor) -> th.Tensor | None:
         """

@@ -173,7 +173,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             _init_setup_model=False,
         )
         options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
-        self._setup_belief(options, action_coef, kl_coef)
+        self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()
 

@@ -43,6 +43,8 @@ class BeliefNetworksMixin(_Policy):
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
+    :param belief_from_features: Whether the belief and its history see the features of an observation, which the features
+        extractor computes, instead of the observation itself; :class:`~sb3_belief.BeliefPPO` turns it on for images
     """
 
     #: The features extractor if the user names none; None for the one that fits the observation space
@@ -66,6 +68,7 @@ class BeliefNetworksMixin(_Policy):
         embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
+        belief_from_features: bool = False,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which builds the networks
@@ -73,10 +76,13 @@ class BeliefNetworksMixin(_Policy):
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, Integral) or width < 1:
                 raise ValueError(f"{name} is {width!r}; it must be an integer of at least 1")
+        if not isinstance(belief_from_features, bool):
+            raise ValueError(f"belief_from_features is {belief_from_features!r}; it must be True or False")
         self.others_action_spaces = dict(others_action_spaces or {})
         self.embedding_dim = embedding_dim
         self.latent_dim = latent_dim
         self.fusion_activation_fn = fusion_activation_fn
+        self.belief_from_features = belief_from_features
         self.layout = action_layout(self.others_action_spaces)
         self.options.check_others(self.others_action_spaces, self.layout)
         self.has_belief = self.options.variant is not None and self.layout.n_others > 0
@@ -101,7 +107,7 @@ class BeliefNetworksMixin(_Policy):
                 # Nothing else draws the rest anew, whose first layer would start with the very weights of the belief's
                 th.manual_seed(int(th.randint(2**62, ())))
             belief = DynamicBelief(
-                get_flattened_obs_dim(self.observation_space),
+                features.features_dim if self.belief_from_features else get_flattened_obs_dim(self.observation_space),
                 self.layout.width,
                 self.embedding_dim,
                 self.latent_dim,
@@ -109,7 +115,7 @@ class BeliefNetworksMixin(_Policy):
                 self.options.belief,
                 self.options.similarity,
             )
-        return BeliefExtractor(self.observation_space, features, belief, self.options)
+        return BeliefExtractor(self.observation_space, features, belief, self.options, self.belief_from_features)
 
     def _build_mlp_extractor(self) -> None:
         if not self.has_belief:
@@ -156,4 +162,5 @@ class BeliefNetworksMixin(_Policy):
             "embedding_dim": self.embedding_dim,
             "latent_dim": self.latent_dim,
             "fusion_activation_fn": self.fusion_activation_fn,
+            "belief_from_features": self.belief_from_features,
         }

@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch.distributions import Distribution
@@ -18,6 +19,9 @@ from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attac
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass, flat_observations
 from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
 from sb3_belief.belief_ppo.others import OthersPrediction, others_rows
+
+# Of how many observations the features are computed at a time
+_FEATURE_ROWS = 64
 
 
 def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,12 +145,23 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """
-        Convert observations to what belief and history take: preprocessed as SB3 does, and flat.
+        Convert observations to what belief and history take: preprocessed as SB3 does and flat, or their features.
 
         :param observations: Observations as the environment returns them, batch first
         :return: ``[B, d_o]``
         """
-        return flat_observations(self, observations)
+        if not (self.has_belief and self._extractor.from_features):
+            return flat_observations(self, observations)
+        self.set_training_mode(False)
+        # A few at a time: the images of a whole history would take gigabytes as floats
+        parts = observations if isinstance(observations, dict) else {"": observations}
+        features = []
+        with th.no_grad():
+            for rows in zip(*(part.split(_FEATURE_ROWS) for part in parts.values()), strict=True):
+                some: Any = dict(zip(parts, rows, strict=True))
+                some = some if isinstance(observations, dict) else some[""]
+                features.append(self._extractor.features(preprocess_obs(some, self.observation_space, self.normalize_images)))
+        return th.cat(features)
 
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 

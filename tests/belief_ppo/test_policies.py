@@ -99,6 +99,7 @@ GIVEN: dict[str, Any] = dict(
     embedding_dim=12,
     latent_dim=6,
     fusion_activation_fn=nn.Tanh,
+    belief_from_features=True,
     net_arch=dict(pi=[9], vf=[8]),
     activation_fn=nn.ELU,
     ortho_init=False,
