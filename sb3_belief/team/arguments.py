@@ -6,9 +6,28 @@ from typing import Any
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecEnvWrapper,
+    VecExtractDictObs,
+    VecFrameStack,
+    VecTransposeImage,
+    unwrap_vec_normalize,
+    unwrap_vec_wrapper,
+)
 
 from sb3_belief.vec_env.team_vec_env import TeamVecEnv
+
+# SB3's wrappers that look at observations take the team for a single agent: they know one done and one last observation of a
+# copy, while each agent of a team has its own, also in the midst of the team's episode
+_REFUSED_WRAPPERS: dict[type[VecEnvWrapper], str] = {
+    VecFrameStack: (
+        "which knows only the ends of the team's episodes, not those of each agent. Stack frames for each agent:"
+        " make_team_env(..., wrapper=partial(supersuit.frame_stack_v2, stack_size=4))."
+    ),
+    VecTransposeImage: "which is not needed: each agent's model puts the channels of its images first. Leave it out.",
+    VecExtractDictObs: "which keeps a single agent's observations: AgentEnv is the environment of a single learner.",
+}
 
 
 def check_team_vec_env(env: Any) -> VecEnv:
@@ -18,7 +37,7 @@ def check_team_vec_env(env: Any) -> VecEnv:
     :param env: What the user gave
     :return: The same
     :raises TypeError: If it is not a ``TeamVecEnv`` or SB3 wrappers around one
-    :raises ValueError: If it is normalised as a whole
+    :raises ValueError: If it has a wrapper that does not do for each agent what it does for one
     """
     if isinstance(env, VecEnv) and isinstance(env.unwrapped, TeamVecEnv):
         if unwrap_vec_normalize(env) is not None:
@@ -26,6 +45,9 @@ def check_team_vec_env(env: Any) -> VecEnv:
                 "The environment of a Team must not be wrapped in VecNormalize, which would not reach the agents' own rewards:"
                 " use Team(..., normalize=True), which gives each agent statistics of its own."
             )
+        for wrapper, why in _REFUSED_WRAPPERS.items():
+            if unwrap_vec_wrapper(env, wrapper) is not None:
+                raise ValueError(f"The environment of a Team must not be wrapped in {wrapper.__name__}, {why}")
         return env
     if isinstance(env, ParallelEnv):
         raise TypeError(
