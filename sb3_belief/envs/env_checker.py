@@ -11,9 +11,11 @@ from typing import Any
 import cloudpickle
 from pettingzoo import AECEnv, ParallelEnv
 
+from sb3_belief.envs.adapters.pettingzoo import in_model_form
 from sb3_belief.envs.random_play import PlayRecord, RandomPlayer, play_randomly
 from sb3_belief.envs.registry import spec
 from sb3_belief.envs.suites import load_attribute
+from sb3_belief.vec_env.observation_forms import ObservationForms
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.user_env import UserEnv, check_interface
 from sb3_belief.vec_env.validation import check_spaces
@@ -103,20 +105,26 @@ def check_team_env(
     try:
         # An environment with faulty spaces cannot be played, so the report ends there
         if _report_spaces(first, report):
-            record = play_randomly(first, n_steps, seed)
+            # Played as a team plays it
+            played, make_played = in_model_form(first), partial(_make_played, make)
+            record = play_randomly(played, n_steps, seed)
             for topic, text in record.faults.items():
                 report.add(topic, "FAIL", text)
             _report_pettingzoo(make, bool(record.masked), report)
             # With the fault "play" the environment could not be stepped, so there is nothing to compare or describe
             if "play" not in record.faults:
-                _report_seeding(make, first, record, seed, report)
+                _report_seeding(make_played, played, record, seed, report)
                 _report_play(record, report)
-                _report_state(first, seed, report)
+                _report_state(played, seed, report)
             _report_pickling(make, report)
             _report_trial(make, n_steps, seed, report)
     finally:
         first.close()
     return report
+
+
+def _make_played(make: Callable[[], Any]) -> ParallelEnv:
+    return in_model_form(UserEnv(make()))
 
 
 def _make_env(make: Callable[[], Any], report: Report) -> UserEnv | None:
@@ -147,7 +155,7 @@ def _known_env(env: Any, report: Report) -> UserEnv | None:
     """Return the environment with names and spaces as a team knows them, if they can be known."""
     try:
         user_env = UserEnv(env)
-        spaces_of = user_env.observation_spaces, user_env.action_spaces
+        spaces_of = ObservationForms(user_env).spaces, user_env.action_spaces
         check_spaces(user_env.possible_agents, *spaces_of, ScriptedOthers(env).action_spaces)
     except Exception as error:
         change = "define possible_agents, observation_space(agent) and action_space(agent) before the first reset"

@@ -8,7 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_belief.vec_env.joint_env import mask_width
+from sb3_belief.vec_env.action_masks import first_actions, mask_parts, mask_width, sample_action
+from sb3_belief.vec_env.observation_forms import as_bytes
 from sb3_belief.vec_env.returned import plain_infos, plain_reset, plain_step
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.user_env import UserEnv, separate_agents
@@ -159,6 +160,8 @@ class RandomPlayer:
         self.visibility, _ = user_env.renamed_members(optional_member(env, "visibility"), None)
         self.scripted = ScriptedOthers(env)
         self.masks: dict[str, np.ndarray] = {}
+        # Whose present mask allows no action, and where it was given
+        self.unable: dict[str, str] = {}
         self.t = 0
 
     def reset(self, seed: int | None) -> bool:
@@ -215,6 +218,7 @@ class RandomPlayer:
                 " (observations, rewards, terminations, truncations, infos)"
             )
             record.fault("play", f"step {self.t} fails with {type(error).__name__}: {error}", change)
+            self._fault_unable(list(self.unable))
             return False
         flags = [(np.any(terminations.get(agent)), np.any(truncations.get(agent))) for agent in before]
         # repr(), because a faulty value may be of any type, and nan would differ from itself
@@ -228,9 +232,8 @@ class RandomPlayer:
 
     def _as_bytes(self, obs: Mapping[str, Any], infos: Mapping[str, Any]) -> tuple:
         # Copies, because an environment may later write into the arrays that it returned
-        observations = [np.asarray(obs[agent]).tobytes() if agent in obs else b"" for agent in self.agents]
-        values = [[np.asarray(infos.get(agent, {}).get(key)).tobytes() for key in KEYS[:-1]] for agent in self.agents]
-        return observations, values
+        observations = [as_bytes(obs[agent]) if agent in obs else b"" for agent in self.agents]
+        return observations, [[as_bytes(infos.get(agent, {}).get(key)) for key in KEYS[:-1]] for agent in self.agents]
 
     def _check_agents(self, what: str, names: Any) -> bool:
         unknown = [name for name in names if name not in self.agents]
@@ -287,12 +290,14 @@ class RandomPlayer:
                     self.record.fault("flags", what, "make it True or False, or leave it out")
         for agent in acted:
             info = infos.get(agent, {})
+            if agent in self.unable and info.get("active", True):
+                self._fault_unable([agent])
             self.record.n_actions += 1
             self.record.n_inactive += not info.get("active", True)
             self.record.life_ends += bool(info.get("life_end", False))
 
     def _check_masks(self, infos: Mapping[str, Any], playing: list[str]) -> None:
-        record, self.masks = self.record, {}
+        record, self.masks, self.unable = self.record, {}, {}
         for agent in playing:
             where = f"{agent!r} at {'step ' + str(self.t) if self.t else 'reset'}"
             if "action_mask" not in infos.get(agent, {}):
@@ -308,13 +313,18 @@ class RandomPlayer:
             if mask.size != width or not np.isin(mask, (0, 1)).all():
                 change = f"give {width} flags, one for each action" if width else "leave it out: Box actions cannot be masked"
                 record.fault("masks", f"that of {where} has {mask.size} entries, {mask.tolist()[:8]}", change)
-            elif not mask.any():
-                change = "allow an action that does nothing, since a model must always choose one"
-                record.fault("masks", f"that of {where} allows no action", change)
+            elif not np.logical_or.reduceat(mask != 0, np.cumsum([0, *mask_parts(self.action_spaces[agent])[:-1]])).all():
+                # Whether it could act at all, the next step's info says
+                self.unable[agent], self.masks[agent] = where, first_actions(self.action_spaces[agent])
             else:
                 self.masks[agent] = mask.astype(bool)
                 record.n_masked += mask.size
                 record.n_possible += int(mask.sum())
+
+    def _fault_unable(self, agents: list[str]) -> None:
+        change = "allow one that does nothing, or say active=False of an agent that cannot act, as one not on turn"
+        for agent in agents:
+            self.record.fault("masks", f"that of {self.unable[agent]} allows no action", change)
 
     def _check_visibility(self, acted: list[str]) -> bytes:
         if self.visibility is None:
@@ -350,30 +360,6 @@ class RandomPlayer:
         return b"".join(np.asarray(rows[agent], dtype=bool).tobytes() for agent in self.agents if agent in rows)
 
 
-def sample_action(space: spaces.Space, mask: np.ndarray | None, rng: np.random.Generator) -> Any:
-    """
-    Return a random action that a mask allows.
-
-    :param space: Action space
-    :param mask: Which actions are possible, bool. None if all are
-    :param rng: Random generator
-    :return: An action of the type that a team passes to an environment
-    """
-    if isinstance(space, spaces.Discrete):
-        return int(rng.choice(np.arange(space.n) if mask is None else np.flatnonzero(mask)))
-    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        sizes = np.full(space.shape, 2).ravel() if isinstance(space, spaces.MultiBinary) else space.nvec.ravel()
-        whole = np.ones(int(sizes.sum()), dtype=bool) if mask is None else mask
-        # A component without a possible action gets 0: the environment is to blame, and its own error is reported
-        parts = np.split(whole, np.cumsum(sizes)[:-1])
-        chosen = [rng.choice(np.flatnonzero(part)) if part.any() else 0 for part in parts]
-        return np.array(chosen, dtype=space.dtype).reshape(space.shape)
-    assert isinstance(space, spaces.Box)
-    # Bounds may be infinite, and a uniform draw needs finite ones
-    low, high = np.maximum(space.low, -1e3), np.minimum(space.high, 1e3)
-    return rng.uniform(low, high).astype(space.dtype)
-
-
 def misfit(space: spaces.Space, value: Any) -> str:
     """
     Return why an observation does not lie in its space. Numbers of another type are accepted if they fit.
@@ -382,6 +368,11 @@ def misfit(space: spaces.Space, value: Any) -> str:
     :param value: Observation
     :return: The reason as the end of a sentence, or an empty string if the observation lies in the space
     """
+    if isinstance(space, spaces.Dict):
+        if not (isinstance(value, Mapping) and value.keys() >= space.spaces.keys()):
+            return f"is no dict with the entries {list(space.spaces)}"
+        reasons = {key: misfit(part, value[key]) for key, part in space.spaces.items()}
+        return next((f"has an entry {key!r} that {reason}" for key, reason in reasons.items() if reason), "")
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         return f"is a {type(value).__name__}"

@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -290,11 +291,20 @@ def normalized(env: VecEnv, normalize: bool | Mapping[str, Any], gamma: float | 
     :param env: The agent's environment
     :param normalize: True, or arguments of ``VecNormalize``
     :param gamma: Discount of the agent's algorithm, used for the returns unless ``normalize`` has one
-    :return: The wrapped environment; observations that are not a ``Box`` stay as they are
+    :return: The wrapped environment; observations that are not a ``Box`` stay as they are, and so do such entries of a
+        ``Dict``, images and entries that ``norm_obs_keys`` leaves out
     """
     arguments = dict(normalize) if isinstance(normalize, Mapping) else {}
     if gamma is not None:
         arguments.setdefault("gamma", gamma)
-    if not isinstance(env.observation_space, spaces.Box):
+    chosen, space = arguments.pop("norm_obs_keys", None), env.observation_space
+    if isinstance(space, spaces.Dict):
+        arguments["norm_obs_keys"] = [
+            key
+            for key, part in space.spaces.items()
+            if isinstance(part, spaces.Box) and not is_image_space(part) and (chosen is None or key in chosen)
+        ]
+    if not (isinstance(space, spaces.Box) or arguments.get("norm_obs_keys")):
         arguments["norm_obs"] = False
+        arguments.pop("norm_obs_keys", None)
     return AgentNormalize(env, **arguments)

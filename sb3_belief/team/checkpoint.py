@@ -18,7 +18,8 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_belief.common.file_names import file_name
 from sb3_belief.common.versions import versions
@@ -82,13 +83,29 @@ class SavedTeam:
         differences = []
         for agent in agents:
             for name, here in (("observation", env.observation_space), ("action", env.action_space)):
-                saved, given = self.manifest[f"{name}_spaces"][agent], str(here[agent])  # type: ignore[index]
-                if saved != given:
+                space: spaces.Space = here[agent]  # type: ignore[index]
+                saved, given = self.manifest[f"{name}_spaces"][agent], str(space)
+                # A team without an environment knows the spaces of its models only
+                if saved not in (given, str(as_models_see(space))):
                     differences.append(f"{agent}: {name} space saved as {saved}, environment has {given}")
         if list(self.scripted.items()) != list(scripted.items()):
             differences.append(f"scripted others saved as {self.scripted}, environment has {scripted} (in this order)")
         if differences:
             raise ValueError("The environment does not fit the saved team: " + "; ".join(differences) + ".")
+
+
+def as_models_see(space: spaces.Space) -> spaces.Space:
+    """
+    Return what becomes of an observation space in a model: SB3 puts the channels of images first.
+
+    :param space: In an environment
+    :return: In a model
+    """
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: as_models_see(part) for key, part in space.spaces.items()})
+    if isinstance(space, spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+        return VecTransposeImage.transpose_space(space)
+    return space
 
 
 def write_team(

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.common.action_encoding import action_encoding
+from sb3_belief.vec_env.observation_forms import row_of
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 AgentStep = tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]
@@ -25,7 +26,7 @@ class AgentTransition(NamedTuple):
     """
     One agent's part of a joint step, as arrays.
 
-    :param obs: Its observations after the step, ``[num_envs, ...]``
+    :param obs: Its observations after the step, ``[num_envs, ...]``: an array, or a dict of arrays for a ``Dict`` space
     :param rewards: Its own rewards, float32 ``[num_envs]``
     :param dones: Whether its own return ended or was cut off, bool ``[num_envs]``
     :param others_actions: The others' flattened actions of this step, zero where not visible, float32 ``[num_envs, W]``
@@ -282,7 +283,7 @@ class TransitionSplitter:
         transitions: list[AgentTransition] = []
         for i, agent in enumerate(self._agents):
             ends = {
-                int(env_idx): self._end(i, obs[agent][env_idx], bool(cut[env_idx, i]), infos[env_idx])
+                int(env_idx): self._end(i, row_of(obs[agent], int(env_idx)), bool(cut[env_idx, i]), infos[env_idx])
                 for env_idx in (np.flatnonzero(dones[:, i]) if any_done else ())
             }
             others = seen_actions[:, self._others[i]]
@@ -292,7 +293,7 @@ class TransitionSplitter:
             )
         return transitions
 
-    def _end(self, i: int, obs: np.ndarray, cut: bool, info: dict[str, Any]) -> dict[str, Any]:
+    def _end(self, i: int, obs: Any, cut: bool, info: dict[str, Any]) -> dict[str, Any]:
         """Return what SB3 expects in the info of a done. Where only the agent's own return has ended, nothing is reset."""
         end = {"terminal_observation": info.get("terminal_observation", {}).get(self._agents[i], obs)}
         end["TimeLimit.truncated"] = cut

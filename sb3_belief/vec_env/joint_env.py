@@ -1,6 +1,6 @@
 """A PettingZoo ``ParallelEnv`` as a single Gymnasium environment, so that SB3's own vectorisers can hold copies of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, KeysView, Mapping
 from functools import partial
 from math import isfinite
 from typing import Any, NamedTuple, TypeAlias
@@ -11,7 +11,9 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
+from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.events import Events, Flags, find_events, no_flags
+from sb3_belief.vec_env.observation_forms import ObservationForms, copied, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
 from sb3_belief.vec_env.returned import (
     StepParts,
@@ -57,6 +59,8 @@ class JointEnv(gym.Env):
     """
     Gymnasium environment of a whole team: observations and actions are dictionaries by agent, the reward is the team's.
 
+    Observations have the form that models take (see ``ObservationForms``): arrays, or dicts of arrays by name, without masks.
+
     An agent that leaves ``agents`` before the others is inactive from then on: its observation is zero, its actions are
     ignored, and its reward is what the environment still reports for it (0 if nothing). The episode continues until all agents
     have left. The info of a step holds a ``StepRecord`` under ``joint``; ``ParallelTeamVecEnv`` turns it into the infos of a
@@ -77,7 +81,9 @@ class JointEnv(gym.Env):
         # What is stepped: mostly the environment itself
         self._game: Any = user_env if user_env.adapts else env
         self.possible_agents: list[str] = user_env.possible_agents
-        self.observation_spaces, self.action_spaces = user_env.observation_spaces, user_env.action_spaces
+        forms = ObservationForms(user_env)
+        self._forms = None if forms.is_identity else forms
+        self.observation_spaces, self.action_spaces = forms.spaces, user_env.action_spaces
         self.observation_space = spaces.Dict(self.observation_spaces)
         self.action_space = spaces.Dict(self.action_spaces)
         self.render_mode = getattr(env, "render_mode", None)
@@ -106,14 +112,17 @@ class JointEnv(gym.Env):
         #: Whether the environment reports ``is_success``, as far as can be known before it does
         self.reports_success = reports_success(env)
         self._others = VisibleOthers(self.possible_agents, list(self.scripted_action_spaces), says)
-        self._zero_obs = {
-            agent: np.zeros(space.shape or (), dtype=space.dtype) for agent, space in self.observation_spaces.items()
-        }
+        self._zero_obs = {agent: zeros_in(space) for agent, space in self.observation_spaces.items()}
         # Set at the first info that holds an action mask
         self._has_masks = False
         # Names and shapes in a form that each step's check can compare with quickly
         self._names = dict.fromkeys(self.possible_agents).keys()
         self._shapes = [(agent, space.shape) for agent, space in self.observation_spaces.items() if space.shape]
+        self._dict_shapes = [
+            (agent, space.spaces.keys(), [(key, part.shape) for key, part in space.spaces.items() if part.shape])
+            for agent, space in self.observation_spaces.items()
+            if isinstance(space, spaces.Dict)
+        ]
         self._copy, self._t = copy, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
@@ -132,6 +141,8 @@ class JointEnv(gym.Env):
             add_note(error, f"Raised by the environment's reset() {self._where}.")
             raise
         obs, infos = plain_reset(result, self._where)
+        if self._forms is not None:
+            obs, infos = self._forms.convert(obs, infos)
         separate_agents(self.env)
         after = self._agents_told()
         if not after:
@@ -158,6 +169,8 @@ class JointEnv(gym.Env):
         except Exception as error:
             add_note(error, f"Raised by the environment's step() {self._where}.")
             raise
+        if self._forms is not None:
+            result = self._converted(result)
         agents = self.possible_agents
         # Here and below, a cheap look decides whether something has to be converted, or the cause of a fault found
         try:
@@ -181,6 +194,9 @@ class JointEnv(gym.Env):
             check_names(agents, before, after, {"observations": obs, "rewards": rewards}, self._where)
         for agent, shape in self._shapes:
             if agent in obs and getattr(obs[agent], "shape", None) != shape:
+                self._check_observations(obs, [agent])
+        for agent, keys, shapes in self._dict_shapes:
+            if agent in obs and not _has_parts(obs[agent], keys, shapes):
                 self._check_observations(obs, [agent])
         team_reward = float(total / len(agents)) if self._team_reward is None else self._own_team_reward(rewards, total)
         # In nearly all steps of nearly all environments nothing happens to any agent, and the loop over agents is saved
@@ -211,10 +227,17 @@ class JointEnv(gym.Env):
                 info["is_success"] = all(events.successes)
         elif left:
             # Copies of the last observations, before zeros replace them
-            info["terminal_observation"] = {agent: np.array(observations[agent]) for agent in left}
+            info["terminal_observation"] = {agent: copied(observations[agent]) for agent in left}
             observations.update({agent: self._zero_obs[agent] for agent in left})
         cut = done and bool(flags.truncated.any())
         return observations, team_reward, done and not cut, cut, info
+
+    def _converted(self, result: Any) -> StepParts:
+        """Return what a step returned with observations in the form that models take, and masks in the infos."""
+        assert self._forms is not None
+        obs, rewards, terminations, truncations, infos = plain_step(result, self._where)
+        obs, infos = self._forms.convert(obs, infos)
+        return obs, rewards, terminations, truncations, infos
 
     def _agents_told(self) -> list[str]:
         """Return the agents in play, also where the environment has None for nobody."""
@@ -291,7 +314,7 @@ class JointEnv(gym.Env):
     def _observations(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
         """Return an array for every possible agent, with zeros for those that the environment left out."""
         return {
-            agent: np.asarray(obs[agent], dtype=zero.dtype) if agent in obs else zero for agent, zero in self._zero_obs.items()
+            agent: map_parts(_as_array, zero, obs[agent]) if agent in obs else zero for agent, zero in self._zero_obs.items()
         }
 
     def _check_observations(self, obs: dict[str, Any], agents: list[str]) -> None:
@@ -349,23 +372,18 @@ def step_and_reset(
     if done:
         info["TimeLimit.truncated"] = truncated and not terminated
         # Copies, since the environment may reuse its arrays at the reset
-        info["terminal_observation"] = {agent: np.array(last) for agent, last in obs.items()}
+        info["terminal_observation"] = {agent: copied(last) for agent, last in obs.items()}
         obs, reset_info = env.reset()
         masks = reset_info.get("action_masks")
     return obs, reward, done, record, masks, info
 
 
-def mask_width(space: spaces.Space) -> int:
-    """
-    Return the number of entries in an action mask, as sb3-contrib's ``MaskablePPO`` expects it.
+def _has_parts(value: Any, keys: KeysView[str], shapes: list[tuple[str, tuple[int, ...]]]) -> bool:
+    """Return whether a dict has all its entries, as arrays of these shapes."""
+    if not (isinstance(value, Mapping) and value.keys() >= keys):
+        return False
+    return all(getattr(value[key], "shape", None) == shape for key, shape in shapes)
 
-    :param space: An action space
-    :return: The number of entries; 0 for a space that cannot be masked
-    """
-    if isinstance(space, spaces.Discrete):
-        return int(space.n)
-    if isinstance(space, spaces.MultiDiscrete):
-        return int(space.nvec.sum())
-    if isinstance(space, spaces.MultiBinary):
-        return 2 * int(np.prod(space.n))
-    return 0
+
+def _as_array(zero: np.ndarray, value: Any) -> np.ndarray:
+    return np.asarray(value, dtype=zero.dtype)

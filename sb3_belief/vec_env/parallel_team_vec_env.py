@@ -1,16 +1,18 @@
 """``TeamVecEnv`` over copies of a PettingZoo ``ParallelEnv``, in this process or in workers, held by SB3's own vectorisers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
-from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.common.exceptions import add_note
+from sb3_belief.vec_env.action_masks import mask_parts, mask_width
+from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
+from sb3_belief.vec_env.observation_forms import parts_of
+from sb3_belief.vec_env.team_vec_env import ObservationStack, TeamObs, TeamStep, TeamVecEnv
 from sb3_belief.vec_env.validation import check_spaces, n_choices, not_a_choice, not_finite, place
 from sb3_belief.vec_env.workers import WorkersVecEnv
 
@@ -39,10 +41,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
             # Before DummyVecEnv fails on them with a message of its own
             first = envs[0]
             check_spaces(first.possible_agents, first.observation_spaces, first.action_spaces, first.scripted_action_spaces)
-            self.venv = _InProcessVecEnv([partial(_same, env) for env in envs])
-            self.venv.layout = [
-                (agent, (len(envs), *(space.shape or ())), space.dtype) for agent, space in first.observation_spaces.items()
-            ]
+            self.venv = _InProcessVecEnv(envs)
         try:
             agents, self._observation_spaces, self._action_spaces, scripted = self._common_members()
             super().__init__(
@@ -56,7 +55,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
         self.reports_success = any(self.venv.get_attr("reports_success"))
         self._discrete = [isinstance(self._action_spaces[agent], spaces.Discrete) for agent in agents]
         self._mask_widths = [mask_width(self._action_spaces[agent]) for agent in agents]
-        self._checks = StepChecks(agents, self._observation_spaces, self._action_spaces, self._mask_widths)
+        self._checks = StepChecks(agents, self._observation_spaces, self._action_spaces)
 
     def _common_members(self) -> list[Any]:
         """Return names, observation spaces and action spaces of the agents, and action spaces of the scripted others."""
@@ -131,7 +130,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
     def _reset_joint(self) -> TeamObs:
         obs: Any = self.venv.reset()
         reset_infos = self.venv.reset_infos
-        self._masks = None
+        self._masks, self._checks.unable = None, {}
         if "action_masks" in reset_infos[0]:
             self._masks = np.array([info["action_masks"] for info in reset_infos])
             self._checks.check_masks(self._masks, np.zeros(self.num_envs, dtype=int))
@@ -144,8 +143,15 @@ class ParallelTeamVecEnv(TeamVecEnv):
             for agent, discrete in zip(self.possible_agents, self._discrete, strict=True)
         ]
         joint_actions: Any = [dict(zip(self.possible_agents, row)) for row in zip(*columns)]  # noqa: B905 (lengths are checked)
-        step: Any = self.venv.step(joint_actions)
-        obs, _, dones, _ = step
+        try:
+            step: Any = self.venv.step(joint_actions)
+        except Exception as error:
+            if self._checks.unable:
+                add_note(error, str(self._checks.refuse_unable(*next(iter(self._checks.unable.items())))))
+            raise
+        obs, _, dones, infos = step
+        if self._checks.unable:
+            self._checks.check_unable(infos)
         self._checks.check_finite(obs, self.venv.agent_rewards, self._lengths)
         if self.venv.action_masks is not None:
             self._masks = self.venv.action_masks
@@ -161,11 +167,31 @@ class _InProcessVecEnv(DummyVecEnv):
     take more time than all else that a joint step needs besides the environment.
     """
 
-    # Agent, shape and dtype of its stacked observations
-    layout: list[tuple[str, tuple[int, ...], Any]]
     # As in WorkersVecEnv
     agent_rewards: np.ndarray
     action_masks: np.ndarray | None = None
+
+    def __init__(self, envs: list[JointEnv]):
+        # SB3's constructor is not called, because it would make buffers, which agents with Dict observations cannot have
+        first = envs[0]
+        self.envs, self.metadata = list[Any](envs), first.metadata
+        VecEnv.__init__(self, len(envs), first.observation_space, first.action_space)
+        self._stack = ObservationStack(len(envs), first.observation_spaces)
+
+    def reset(self) -> Any:
+        """
+        Reset all copies.
+
+        :return: Observations ``[num_envs, ...]`` by agent
+        """
+        resets = [
+            env.reset(seed=seed, options=options or None)
+            for env, seed, options in zip(self.envs, self._seeds, self._options, strict=True)
+        ]
+        self.reset_infos = [info for _, info in resets]
+        self._reset_seeds()
+        self._reset_options()
+        return self._stack([obs for obs, _ in resets])
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -178,12 +204,6 @@ class _InProcessVecEnv(DummyVecEnv):
         actions: Any = self.actions
         steps = [step_and_reset(env, action) for env, action in zip(envs, actions, strict=True)]
         observations, rewards, dones, records, masks, others = zip(*steps, strict=True)
-        # concatenate() takes a third of the time of array()
-        stack = partial(np.concatenate, axis=None, casting="unsafe")
-        stacked = {
-            agent: stack([obs[agent] for obs in observations], dtype=dtype).reshape(shape)
-            for agent, shape, dtype in self.layout
-        }
         self.agent_rewards = np.array([record.agent_rewards for record in records], dtype=np.float32)
         infos = []
         for record, own_rewards, other in zip(records, self.agent_rewards, others, strict=True):
@@ -201,11 +221,7 @@ class _InProcessVecEnv(DummyVecEnv):
                 info.update(other)
             infos.append(info)
         self.action_masks = None if masks[0] is None else np.array(masks)
-        return stacked, np.array(rewards, dtype=np.float32), np.array(dones), infos
-
-
-def _same(env: JointEnv) -> JointEnv:
-    return env
+        return self._stack(observations), np.array(rewards, dtype=np.float32), np.array(dones), infos
 
 
 class StepChecks:
@@ -217,7 +233,6 @@ class StepChecks:
     :param agents: Names of the agents
     :param observation_spaces: Observation space of each agent
     :param action_spaces: Action space of each agent
-    :param mask_widths: Width of each agent's mask, in order; 0 for an agent that cannot be masked
     """
 
     def __init__(
@@ -225,16 +240,27 @@ class StepChecks:
         agents: Sequence[str],
         observation_spaces: Mapping[str, spaces.Space],
         action_spaces: Mapping[str, spaces.Space],
-        mask_widths: Sequence[int],
     ):
         self._agents, self._action_spaces = list(agents), action_spaces
-        self._floats = [agent for agent in agents if np.issubdtype(observation_spaces[agent].dtype, np.floating)]
-        choices = {agent: n_choices(observation_spaces[agent]) for agent in agents}
-        self._choices = {agent: n for agent, n in choices.items() if n is not None}
-        self._observation_spaces = observation_spaces
+        self._floats = [
+            (agent, key)
+            for agent in agents
+            for key, part in parts_of(observation_spaces[agent]).items()
+            if np.issubdtype(part.dtype, np.floating)
+        ]
+        self._choices = [
+            (agent, key, part, n_choices(part))
+            for agent in agents
+            for key, part in parts_of(observation_spaces[agent]).items()
+            if n_choices(part) is not None
+        ]
         self._bounds = {agent: _bounds(action_spaces[agent]) for agent in agents}
-        self._masked = [agent for agent, width in zip(agents, mask_widths, strict=True) if width]
-        self._mask_starts = [sum(mask_widths[:i]) for i, width in enumerate(mask_widths) if width]
+        parts = [(i, size) for i, agent in enumerate(agents) for size in mask_parts(action_spaces[agent])]
+        # Whose each dimension of the masks is, and where it begins
+        self._mask_owners = [i for i, _ in parts]
+        self._mask_starts = np.cumsum([0, *(size for _, size in parts[:-1])])
+        #: Agents whose present mask allows no action, {(copy, number of the agent): step}
+        self.unable: dict[tuple[int, int], int] = {}
 
     def check_discrete(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> list[int]:
         """
@@ -277,7 +303,7 @@ class StepChecks:
             " others."
         )
 
-    def check_finite(self, obs: Mapping[str, np.ndarray], rewards: np.ndarray, steps: np.ndarray) -> None:
+    def check_finite(self, obs: Mapping[str, Any], rewards: np.ndarray, steps: np.ndarray) -> None:
         """
         Check that observations and rewards are finite, and discrete observations in their spaces.
 
@@ -286,37 +312,69 @@ class StepChecks:
         :param steps: How many steps each copy's episode has had, int ``[num_envs]``
         :raises ValueError: If a number is not finite, or an observation not in its space
         """
-        for agent, n in self._choices.items():
-            fits = (obs[agent] >= 0) & (obs[agent] < n)
+        for agent, key, space, n in self._choices:
+            values = obs[agent] if key is None else obs[agent][key]
+            fits = (values >= 0) & (values < n)
             if not fits.all():
                 copy = int(np.argmin(fits.reshape(len(steps), -1).all(axis=1)))
                 where = place(copy, int(steps[copy]) + 1)
-                raise not_a_choice(agent, obs[agent][copy], self._observation_spaces[agent], where)
-        for agent in self._floats:
-            if not _all_finite(obs[agent]):
-                copy = int(np.argmin(np.isfinite(obs[agent]).reshape(len(steps), -1).all(axis=1)))
-                raise not_finite(f"observation of {agent!r}", obs[agent][copy], place(copy, int(steps[copy]) + 1))
+                raise not_a_choice(_name(agent, key), values[copy], agent, space, where)
+        for agent, key in self._floats:
+            values = obs[agent] if key is None else obs[agent][key]
+            if not _all_finite(values):
+                copy = int(np.argmin(np.isfinite(values).reshape(len(steps), -1).all(axis=1)))
+                raise not_finite(_name(agent, key), values[copy], place(copy, int(steps[copy]) + 1))
         if not _all_finite(rewards):
             copy, i = (int(k) for k in np.argwhere(~np.isfinite(rewards))[0])
             raise not_finite(f"reward of {self._agents[i]!r}", rewards[copy, i], place(copy, int(steps[copy]) + 1))
 
     def check_masks(self, masks: np.ndarray, steps: np.ndarray) -> None:
         """
-        Check that masks allow at least one action.
+        Find masks that allow no action, and let these allow the first one, since a model must choose something.
 
-        :param masks: Masks of all agents side by side, bool ``[num_envs, sum of mask_widths]``
+        :param masks: Masks of all agents side by side, bool ``[num_envs, width of all]``, changed in place
         :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        :raises ValueError: If a mask allows nothing
         """
-        if not self._masked:
+        self.unable = {}
+        if not self._mask_owners:
             return
         possible = np.logical_or.reduceat(masks, self._mask_starts, axis=1)
         if not possible.all():
-            copy, i = (int(k) for k in np.argwhere(~possible)[0])
-            raise ValueError(
-                f"The action mask of {self._masked[i]!r} {place(copy, int(steps[copy]))} allows no action: a model must always"
-                " choose one, so allow one that does nothing, also for an agent that is out of play."
-            )
+            for copy, k in np.argwhere(~possible).tolist():
+                masks[copy, self._mask_starts[k]] = True
+                self.unable[copy, self._mask_owners[k]] = int(steps[copy])
+
+    def check_unable(self, infos: list[dict[str, Any]]) -> None:
+        """
+        Check that agents whose masks allowed no action were out of play in the step that followed.
+
+        Only now is it known: an agent that is not on turn, for instance, is.
+
+        :param infos: Of that step
+        :raises ValueError: If one was in play
+        """
+        for (copy, i), step in self.unable.items():
+            if infos[copy]["active"][i]:
+                raise self.refuse_unable((copy, i), step)
+
+    def refuse_unable(self, which: tuple[int, int], step: int) -> ValueError:
+        """
+        Return the error for an agent whose mask allows no action although it is in play.
+
+        :param which: Copy and number of the agent
+        :param step: Of its episode, in which the mask was given
+        """
+        agent = self._agents[which[1]]
+        return ValueError(
+            f"The action mask of {agent!r} {place(which[0], step)} allows no action: a model must always choose one, so allow"
+            " one that does nothing. If it could not act in the next step, as one that is not on turn, let the environment"
+            f" say infos[{agent!r}]['active'] = False there. A turn-based AEC game is converted by"
+            " sb3_belief.envs.to_parallel(env, turn_based=True)."
+        )
+
+
+def _name(agent: str, key: str | None) -> str:
+    return f"observation of {agent!r}" if key is None else f"entry {key!r} of the observation of {agent!r}"
 
 
 def _all_finite(values: np.ndarray) -> bool:

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.common.file_names import file_name
+from sb3_belief.vec_env.observation_forms import parts_of
 from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
@@ -82,7 +83,8 @@ class TeamVecEnv(VecEnv):
 
     :param num_envs: Number of copies
     :param possible_agents: Names of the agents; their order is the order of every array over agents
-    :param observation_spaces: Observation space of each agent (not nested: no ``Dict``, no ``Tuple``)
+    :param observation_spaces: Observation space of each agent (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``),
+        or a ``Dict`` of such spaces by name (not nested), whose observations are dicts of arrays
     :param action_spaces: Action space of each agent (``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or ``Box``)
     :param render_mode: Render mode of the copies (None, "rgb_array" or "human")
     :param scripted_action_spaces: Action space of each scripted other (a partner that belongs to the environment and does not
@@ -308,3 +310,38 @@ class TeamVecEnv(VecEnv):
                     f" got {checked[agent].shape}."
                 )
         return checked
+
+
+class ObservationStack:
+    """
+    Stacks the observations of all copies.
+
+    :param num_envs: Number of copies
+    :param observation_spaces: Observation space of each agent
+    """
+
+    def __init__(self, num_envs: int, observation_spaces: Mapping[str, spaces.Space]):
+        self._layout = [
+            (agent, [(key, (num_envs, *(part.shape or ())), part.dtype) for key, part in parts_of(space).items()])
+            for agent, space in observation_spaces.items()
+        ]
+
+    def __call__(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """
+        Stack observations.
+
+        :param observations: For each copy, observations by agent
+        :return: ``[num_envs, ...]`` by agent
+        """
+        stacked: dict[str, Any] = {}
+        for agent, parts in self._layout:
+            for key, shape, dtype in parts:
+                # concatenate() takes a third of the time of array()
+                if key is None:
+                    rows = [obs[agent] for obs in observations]
+                    stacked[agent] = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
+                else:
+                    rows = [obs[agent][key] for obs in observations]
+                    array = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
+                    stacked.setdefault(agent, {})[key] = array
+        return stacked

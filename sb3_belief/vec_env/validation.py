@@ -41,17 +41,17 @@ def check_spaces(
     allowed = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
     kinds = ", ".join(kind.__name__ for kind in allowed)
     for agent in agents:
-        if isinstance(observation_spaces[agent], (spaces.Dict, spaces.Tuple)):
+        space = observation_spaces[agent]
+        parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+        if not parts or not all(isinstance(part, allowed) for part in parts):
             raise ValueError(
-                f"The observation space of {agent!r} is nested ({observation_spaces[agent]}), which is not supported:"
-                " flatten it in the environment (gymnasium.spaces.flatten_space and flatten)."
+                f"The observation space of {agent!r} is {space}; allowed are {kinds}, and a Dict of these. An environment's"
+                " own may also be a Tuple or nested, which sb3_belief.envs.to_parallel() converts."
             )
-        if not isinstance(observation_spaces[agent], allowed):
-            raise ValueError(f"The observation space of {agent!r} is {observation_spaces[agent]}; allowed are {kinds}.")
-        if np.any(getattr(observation_spaces[agent], "start", 0)):
+        if any(np.any(getattr(part, "start", 0)) for part in parts):
             raise ValueError(
-                f"The observation space of {agent!r} is {observation_spaces[agent]}: SB3 encodes observations from 0, so the"
-                " environment must count from 0 too (start=0)."
+                f"The observation space of {agent!r} is {space}: SB3 encodes observations from 0, so the environment must"
+                " count from 0 too (start=0)."
             )
         actions = action_spaces[agent]
         if isinstance(actions, spaces.Box) and not (np.isfinite(actions.low) & np.isfinite(actions.high)).all():
@@ -147,6 +147,21 @@ def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -
     :param where: Copy and step, in words
     :raises ValueError: If shape or numbers are not those of an observation
     """
+    if isinstance(space, spaces.Dict):
+        if not (isinstance(value, Mapping) and value.keys() >= space.spaces.keys()):
+            given = f"the entries {list(value)}" if isinstance(value, Mapping) else f"the type {type(value).__name__}"
+            raise ValueError(
+                f"The observation of {agent!r} {where} has {given}, but its observation space is a Dict with the entries"
+                f" {list(space.spaces)}: return a dict of these, or correct observation_space({agent!r})."
+            )
+        for key, part in space.spaces.items():
+            _check_part(agent, f"entry {key!r} of the observation of {agent!r}", value[key], part, where)
+    else:
+        _check_part(agent, f"observation of {agent!r}", value, space, where)
+
+
+def _check_part(agent: str, what: str, value: Any, space: spaces.Space, where: str) -> None:
+    """Check an observation, or an entry of one."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -154,7 +169,7 @@ def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -
         array = np.asarray(value, dtype=object)
     if array.shape != (space.shape or ()) or array.dtype.kind not in "biuf":
         raise ValueError(
-            f"The observation of {agent!r} {where} has the shape {array.shape} and type {array.dtype}, but its observation"
+            f"The {what} {where} has the shape {array.shape} and type {array.dtype}, but its observation"
             f" space is {space}: return an array of that shape, or correct observation_space({agent!r})."
         )
     if array.dtype.kind == "f":
@@ -162,10 +177,10 @@ def check_observation(agent: str, value: Any, space: spaces.Space, where: str) -
         with np.errstate(over="ignore"):
             array = array.astype(space.dtype if np.issubdtype(space.dtype, np.floating) else array.dtype, copy=False)
         if not np.isfinite(array).all():
-            raise not_finite(f"observation of {agent!r}", array, where)
+            raise not_finite(what, array, where)
     choices = n_choices(space)
     if choices is not None and not ((array >= 0) & (array < choices)).all():
-        raise not_a_choice(agent, array, space, where)
+        raise not_a_choice(what, array, agent, space, where)
 
 
 def n_choices(space: spaces.Space) -> Any:
@@ -182,17 +197,18 @@ def n_choices(space: spaces.Space) -> Any:
     return 2 if isinstance(space, spaces.MultiBinary) else None
 
 
-def not_a_choice(agent: str, value: np.ndarray, space: spaces.Space, where: str) -> ValueError:
+def not_a_choice(what: str, value: np.ndarray, agent: str, space: spaces.Space, where: str) -> ValueError:
     """
     Return the error for an observation that is none of a discrete space.
 
+    :param what: What it is, and of which agent
+    :param value: The observation, or an entry of it
     :param agent: Name of the agent
-    :param value: Its observation
-    :param space: Its observation space
+    :param space: Its space
     :param where: Copy and step, in words
     """
     return ValueError(
-        f"The observation of {agent!r} {where} is {value.tolist()}, which is not in its observation space {space}: return what"
+        f"The {what} {where} is {value.tolist()}, which is not in its observation space {space}: return what"
         f" lies in it, or correct observation_space({agent!r})."
     )
 

@@ -20,7 +20,10 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 
 from sb3_belief.common.processes import Inbox, check_may_have_workers, leave_interrupts_to_main, start_context
-from sb3_belief.vec_env.joint_env import JointEnv, mask_width, step_and_reset
+from sb3_belief.vec_env.action_masks import mask_width
+from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
+from sb3_belief.vec_env.observation_forms import parts_of
+from sb3_belief.vec_env.team_vec_env import ObservationStack
 
 # Messages with a step's actions begin with this byte; all other messages are pickles, which begin with another one
 _STEP = b"s"
@@ -39,10 +42,11 @@ def row_type(
     :param observation_spaces: Observation space of each agent
     :param action_spaces: Action space of each agent
     :param scripted_action_spaces: Action space of each scripted other
-    :return: The type; in ``observations``, the field of an agent has its number as its name
+    :return: The type; in ``observations``, the field of an agent has its number as its name, and so have the fields of the
+        entries of a dict within it
     """
     n = len(observation_spaces)
-    observations = [(str(i), space.dtype, space.shape or ()) for i, space in enumerate(observation_spaces.values())]
+    observations = [(str(i), *_field(space)) for i, space in enumerate(observation_spaces.values())]
     return np.dtype(
         [
             ("observations", observations),
@@ -56,6 +60,13 @@ def row_type(
             ("action_masks", bool, (sum(map(mask_width, action_spaces.values())),)),
         ]
     )
+
+
+def _field(space: spaces.Space) -> tuple[Any, ...]:
+    """Return type and, except for a dict, shape of the field of an agent's observations."""
+    if isinstance(space, spaces.Dict):
+        return ([(str(j), *_field(part)) for j, part in enumerate(space.spaces.values())],)
+    return space.dtype, space.shape or ()
 
 
 class WorkersVecEnv(SubprocVecEnv):
@@ -87,7 +98,7 @@ class WorkersVecEnv(SubprocVecEnv):
         self.inboxes = [Inbox(remote, process) for remote, process in zip(self.remotes, self.processes, strict=True)]
         self.remotes[0].send(("get_spaces", None))
         VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
-        self._agents: list[str] = []
+        self._observation_spaces: dict[str, spaces.Space] = {}
         self._row_type = np.dtype([])
 
     def set_members(
@@ -103,7 +114,8 @@ class WorkersVecEnv(SubprocVecEnv):
         :param action_spaces: Action space of each agent
         :param scripted_action_spaces: Action space of each scripted other
         """
-        self._agents = list(observation_spaces)
+        self._observation_spaces = observation_spaces
+        self._stack = ObservationStack(self.num_envs, observation_spaces)
         self._row_type = row_type(observation_spaces, action_spaces, scripted_action_spaces)
         self._info_names = _INFO_FIELDS + ("scripted_actions",) * bool(scripted_action_spaces)
 
@@ -141,7 +153,13 @@ class WorkersVecEnv(SubprocVecEnv):
     def reset(self) -> Any:
         self.finish_step()
         with self._reports_deaths("reset"):
-            return super().reset()
+            # As in SB3, which cannot stack nested dicts
+            for remote, seed, options in zip(self.remotes, self._seeds, self._options, strict=True):
+                remote.send(("reset", (seed, options)))
+            observations, self.reset_infos = zip(*[remote.recv() for remote in self.remotes], strict=True)  # type: ignore
+        self._reset_seeds()
+        self._reset_options()
+        return self._stack(observations)
 
     def close(self) -> None:
         self.finish_step()
@@ -205,7 +223,10 @@ class WorkersVecEnv(SubprocVecEnv):
         size = self._row_type.itemsize
         rows = np.frombuffer(b"".join([message[:size] for message in messages]), dtype=self._row_type)
         # Copies, since rows are read-only, and whoever kept a view of one field would keep the whole array alive
-        observations = {agent: rows["observations"][str(i)].copy() for i, agent in enumerate(self._agents)}
+        observations = {
+            agent: _unpacked(rows["observations"][str(i)], space)
+            for i, (agent, space) in enumerate(self._observation_spaces.items())
+        }
         columns = [rows[name].copy() for name in self._info_names]
         self.agent_rewards = columns[0]
         infos = [dict(zip(self._info_names, entries, strict=True)) for entries in zip(*columns, strict=True)]
@@ -215,6 +236,13 @@ class WorkersVecEnv(SubprocVecEnv):
                 info.update(pickle.loads(message[size:]))
         self.action_masks = rows["action_masks"].copy() if rows["has_masks"][0] else None
         return observations, rows["reward"].copy(), rows["done"].copy(), infos
+
+
+def _unpacked(field: np.ndarray, space: spaces.Space) -> Any:
+    """Copy an agent's observations out of the rows of all copies."""
+    if isinstance(space, spaces.Dict):
+        return {key: field[str(j)].copy() for j, key in enumerate(space.spaces)}
+    return field.copy()
 
 
 class PackedSteps:
@@ -229,7 +257,11 @@ class PackedSteps:
         dtype = row_type(env.observation_spaces, env.action_spaces, env.scripted_action_spaces)
         self._row = np.zeros((), dtype=dtype)
         # Views of the row, made once: each step writes into them
-        self._observations = [(agent, self._row["observations"][str(i)]) for i, agent in enumerate(env.observation_spaces)]
+        self._observations: list[tuple[str, str | None, np.ndarray]] = []
+        for i, (agent, space) in enumerate(env.observation_spaces.items()):
+            field = self._row["observations"][str(i)]
+            for j, key in enumerate(parts_of(space)):
+                self._observations.append((agent, key, field if key is None else field[str(j)]))
         self._fields = {name: self._row[name] for name in dtype.names or ()}
 
     def __call__(self, actions: tuple[Any, ...]) -> bytes:
@@ -243,8 +275,8 @@ class PackedSteps:
         fields = self._fields
         joint_action = dict(zip(self._env.possible_agents, actions, strict=True))
         obs, reward, done, record, masks, others = step_and_reset(self._env, joint_action)
-        for agent, field in self._observations:
-            field[...] = obs[agent]
+        for agent, key, field in self._observations:
+            field[...] = obs[agent] if key is None else obs[agent][key]
         fields["reward"][...], fields["done"][...] = reward, done
         fields["agent_rewards"][...], fields["visible"][...] = record.agent_rewards, record.visible
         fields["active"][...], fields["life_end"][...], fields["truncated"][...] = record.flags

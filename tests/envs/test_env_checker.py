@@ -256,10 +256,10 @@ def test_a_state_that_lacks_something():
 
 
 class Nested(ToyEnv):
-    """A ``ToyEnv`` with a nested observation space."""
+    """A ``ToyEnv`` with a nested observation space that no model takes."""
 
     def observation_space(self, agent):
-        return spaces.Dict({"a": spaces.Box(0, 1, (2,), np.float32)})
+        return spaces.Dict({"a": spaces.Tuple([spaces.Text(3)])})
 
 
 class Fickle(ToyEnv):
@@ -294,7 +294,7 @@ ONE = ToyEnv()
 @pytest.mark.parametrize(
     ("env", "topic", "message"),
     [
-        (Nested, "spaces", "The observation space of 'agent_0' is nested"),
+        (Nested, "spaces", "The observation space of 'agent_0' is Dict('a/0': Text("),
         (Fickle, "spaces", "differ from call to call. Change: make them once"),
         (ResetsWrong, "play", "reset() fails with ValueError: reset() returned a tuple of 3"),
         (NobodyPlays, "play", "agents is empty after reset()"),

@@ -284,8 +284,8 @@ class SpaceEnv(ToyEnv):
 @pytest.mark.parametrize(
     "given, says",
     [
-        ({"observation_space": spaces.Dict({"x": spaces.Discrete(2)})}, "'agent_0' is nested.*flatten"),
-        ({"observation_space": spaces.Tuple([spaces.Discrete(2)])}, "nested"),
+        ({"observation_space": spaces.Dict({"x": spaces.Text(2)})}, "'agent_0' is Dict.*Text.*; allowed are Discrete"),
+        ({"observation_space": spaces.Tuple([spaces.Text(2)])}, "'agent_0' is Dict.'0'.*; allowed are Discrete"),
         ({"action_space": spaces.Tuple([spaces.Discrete(2)])}, "allowed are Discrete, MultiDiscrete, MultiBinary, Box"),
         ({"action_space": spaces.Discrete(3, start=1)}, "start"),
     ],

@@ -236,11 +236,15 @@ class NoWay(MaskedEnv):
     A ``MaskedEnv`` whose mask of ``agent_1`` allows no action after a given step.
 
     :param at: The step, 0 for the reset
+    :param strict: Whether it raises where an agent does what its mask forbids
     """
 
-    def __init__(self, at):
+    def __init__(self, at, strict=False):
         super().__init__(n_agents=3, limit=5)
-        self.at = at
+        self.at, self.strict = at, strict
+
+    def step(self, actions):
+        return super().step(actions) if self.strict else ToyEnv.step(self, actions)
 
     def infos(self):
         infos = super().infos()
@@ -258,6 +262,15 @@ def test_a_mask_that_allows_nothing(at, place):
             env.step({agent: np.argmax(env.action_masks().get(agent, np.ones((2, 3))), axis=1) for agent in ACTIONS})
 
 
+def test_a_mask_that_allows_nothing_explains_the_error_of_the_environment():
+    env = make_team_env(partial(NoWay, 0, strict=True))
+    env.reset()
+    with pytest.raises(ValueError, match="agent_1 did 0 at step 0") as caught:
+        env.step({agent: np.zeros(1, int) for agent in ACTIONS})
+    says = "The action mask of 'agent_1' in environment copy 0 at reset allows no action"
+    assert any(note.startswith(says) for note in caught.value.__notes__)
+
+
 def test_a_mask_of_the_wrong_size():
     class Short(MaskedEnv):
         def infos(self):
@@ -266,19 +279,6 @@ def test_a_mask_of_the_wrong_size():
     message = "mask of 'agent_0' in environment copy 0 at reset must have 3 entries, one for each action, got 2"
     with pytest.raises(ValueError, match=message):
         make_team_env(Short).reset()
-
-
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
-def test_nested_observations(vec_env):
-    with pytest.raises(ValueError, match="The observation space of 'agent_0' is nested"):
-        make_team_env(Nested, n_envs=2, vec_env=vec_env)
-
-
-class Nested(ToyEnv):
-    """A ``ToyEnv`` with a nested observation space."""
-
-    def observation_space(self, agent):
-        return spaces.Dict({"a": spaces.Box(0, 1, (2,), np.float32)})
 
 
 class Wordy(ToyEnv):

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel
+from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from sb3_belief.envs.suites import unknown_name
+from sb3_belief.vec_env.action_masks import first_actions
+from sb3_belief.vec_env.observation_forms import ObservationForms
 
 _GROUPS = ("atari", "butterfly", "classic", "sisl")
 
@@ -75,29 +77,47 @@ def make(name: str, **env_kwargs: Any) -> ParallelEnv:
     return Pursuit(env) if name.startswith("sisl.pursuit_v") else env
 
 
-def to_parallel(env: AECEnv | ParallelEnv) -> ParallelEnv:
+def to_parallel(env: AECEnv | ParallelEnv, turn_based: bool | None = None) -> ParallelEnv:
     """
     Convert a PettingZoo environment to one that a team can play, with PettingZoo's own conversions.
 
     - An AEC environment with ``is_parallelizable`` in its metadata is converted by ``aec_to_parallel``.
     - Any other AEC environment is turn-based and converted by ``turn_based_aec_to_parallel``. All agents act at each step, but
-      only the action of the agent whose turn it is counts. The others see that action and can only choose action 0.
-    - Observations of the form ``{"observation": ..., "action_mask": ...}``, PettingZoo's convention, are split, and the masks
-      are moved to the infos.
+      only the action of the agent whose turn it is counts, and only for that agent the step is an active one (``active`` in
+      the infos). The others see that action and can only choose action 0. Rewards that they get meanwhile count for what they
+      did before.
+    - Observations that models do not take are converted. Masks beside an observation, as in PettingZoo's
+      ``{"observation": ..., "action_mask": ...}``, are moved to the infos, whatever the other entries are called. Tuples and
+      nested dicts become dicts of one level (``"sensors/camera"``).
 
     :param env: The environment, AEC or parallel
+    :param turn_based: Whether an AEC environment is turn-based; None to go by its metadata
     :return: The parallel environment
     :raises TypeError: If it is neither
+    :raises ValueError: If ``turn_based`` is given for a parallel environment
     """
     if isinstance(env, AECEnv):
-        if env.metadata.get("is_parallelizable", False):
-            env = aec_to_parallel(env)
-        else:
-            return SplitMasks(TurnBased(env))
+        if turn_based is None:
+            turn_based = not env.metadata.get("is_parallelizable", False)
+        return TurnBased(env) if turn_based else AllAtOnce(env)
     if not isinstance(env, ParallelEnv):
         raise TypeError(f"to_parallel() needs an AECEnv or a ParallelEnv of PettingZoo, got {type(env).__name__}.")
-    masked = [agent for agent in env.possible_agents if _has_mask(env.observation_space(agent))]
-    return SplitMasks(env) if masked else env
+    if turn_based is not None:
+        raise ValueError(
+            f"turn_based={turn_based} says how to convert an AECEnv, but {type(env).__name__} is a ParallelEnv: leave it out."
+            " An environment of this kind says by infos[agent]['active'] = False who could not act in a step."
+        )
+    return in_model_form(env)
+
+
+def in_model_form(env: ParallelEnv) -> ParallelEnv:
+    """
+    Convert the observations of an environment, if they need it.
+
+    :param env: The environment
+    :return: The same, or a :class:`ModelObservations` around it
+    """
+    return env if ObservationForms(env).is_identity else ModelObservations(env)
 
 
 class Adapter(BaseParallelWrapper):
@@ -134,6 +154,73 @@ class Adapter(BaseParallelWrapper):
         return getattr(self.env, name) if hasattr(self.env, name) else getattr(self.env.unwrapped, name)
 
 
+class AllAtOnce(Adapter):
+    """
+    AEC environment whose agents all act at once, on what they observed at the beginning of the cycle.
+
+    :param env: The AEC environment
+    """
+
+    def __init__(self, env: AECEnv):
+        if not env.metadata.get("is_parallelizable", False):
+            # to_parallel(env, turn_based=False) overrides what PettingZoo's conversion looks at
+            env.metadata = {**env.metadata, "is_parallelizable": True}
+        super().__init__(in_model_form(aec_to_parallel(env)))
+        self._aec = env
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """
+        Reset the environment.
+
+        :param seed: Seed of the environment. With None its random generator continues
+        :param options: Passed on to the environment
+        :return: Observations and infos, by agent
+        :raises ValueError: If an agent cannot act, as in a turn-based game
+        """
+        obs, infos = self.env.reset(seed=seed, options=options)
+        self._check_masks(infos)
+        return obs, infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """
+        Let all agents act in a cycle.
+
+        :param actions: Actions by agent
+        :return: Observations, rewards, terminations, truncations and infos, by agent
+        :raises ValueError: If the agents do not act in a cycle, as in a turn-based game
+        """
+        try:
+            step = self.env.step(actions)
+        except AssertionError as error:
+            if "Parallel environment wrapper expects" not in str(error):
+                raise
+            raise self._refusal(str(error)) from error
+        self._check_masks(step[-1])
+        return step
+
+    def _check_masks(self, infos: dict[str, dict[str, Any]]) -> None:
+        for agent in self.agents:
+            if not np.any(infos.get(agent, {}).get("action_mask", True)):
+                raise self._refusal(f"the action mask of {agent!r} allows nothing at the beginning of a cycle.")
+
+    def _refusal(self, why: str) -> ValueError:
+        return ValueError(
+            f"{type(self._aec.unwrapped).__name__} is not played by all agents at once, although is_parallelizable in its"
+            f" metadata says so: {why} Use sb3_belief.envs.to_parallel(env, turn_based=True)."
+        )
+
+
+class _Turns(turn_based_aec_to_parallel_wrapper):
+    """PettingZoo's conversion, with what the others observe once those who are out have left."""
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        obs, rewards, terminations, truncations, infos = super().step(actions)
+        if len(self.agents) < len(obs):
+            # Until then one who is out was on turn, and nobody else had an action in its mask
+            obs.update({agent: self.aec_env.observe(agent) for agent in self.agents})
+        return obs, rewards, terminations, truncations, infos
+
+
 class TurnBased(Adapter):
     """
     Turn-based game, in which all others see the action of the agent whose turn it is.
@@ -142,7 +229,7 @@ class TurnBased(Adapter):
     """
 
     def __init__(self, env: AECEnv):
-        super().__init__(turn_based_aec_to_parallel(env))
+        super().__init__(in_model_form(_Turns(env)))
         self._aec = env
         self._moved = ""
 
@@ -155,7 +242,8 @@ class TurnBased(Adapter):
         :return: Observations and infos, by agent
         """
         self._moved = ""
-        return self.env.reset(seed=seed, options=options)
+        obs, infos = self.env.reset(seed=seed, options=options)
+        return obs, self._with_turns(infos)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
@@ -164,8 +252,20 @@ class TurnBased(Adapter):
         :param actions: Actions of all agents. Only that of the agent whose turn it is counts
         :return: Observations, rewards, terminations, truncations and infos, by agent
         """
-        self._moved = self._aec.agent_selection
-        return self.env.step(actions)
+        acted, self._moved = list(self.agents), self._aec.agent_selection
+        obs, rewards, terminations, truncations, infos = self.env.step(actions)
+        infos = self._with_turns(infos)
+        for agent in acted:
+            infos[agent] = {**infos.get(agent, {}), "active": agent == self._moved}
+        return obs, rewards, terminations, truncations, infos
+
+    def _with_turns(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Return infos in which the masks of all who are not on turn allow action 0 only, whatever the game gives them."""
+        infos = dict(infos)
+        for agent, info in infos.items():
+            if agent != self._aec.agent_selection and "action_mask" in info:
+                infos[agent] = {**info, "action_mask": first_actions(self.action_space(agent))}
+        return infos
 
     def visibility(self) -> dict[str, np.ndarray]:
         """
@@ -179,59 +279,48 @@ class TurnBased(Adapter):
         }
 
 
-class SplitMasks(Adapter):
+class ModelObservations(Adapter):
     """
-    Wrapper that moves the masks of observations ``{"observation": ..., "action_mask": ...}`` to the infos.
+    Wrapper that brings observations into the form that models take: arrays or dicts of arrays, with the masks in the infos.
 
-    A mask that allows no action, as for an agent whose turn it is not, is changed to allow action 0, since a model must always
-    choose one.
+    A team does so itself; the wrapper is for those who play the environment by hand. See :class:`ObservationForms`.
 
-    :param env: The environment. Observations of another form are left unchanged
+    :param env: The environment
     """
 
     def __init__(self, env: ParallelEnv):
         super().__init__(env)
-        self._masked = [agent for agent in self.possible_agents if _has_mask(env.observation_space(agent))]
+        self._forms = ObservationForms(env)
 
     def observation_space(self, agent: str) -> spaces.Space:
         """
         Return the observation space of an agent.
 
         :param agent: Name of the agent
-        :return: Space of its observations without the mask
+        :return: Space of its observations in that form
         """
-        space: Any = self.env.observation_space(agent)
-        return space["observation"] if agent in self._masked else space
+        return self._forms.spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
-        Reset the environment and move the masks to the infos.
+        Reset the environment and convert its observations.
 
         :param seed: Seed of the environment. With None its random generator continues
         :param options: Passed on to the environment
         :return: Observations and infos, by agent
         """
-        return self._split(*self.env.reset(seed=seed, options=options))
+        return self._forms.convert(*self.env.reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        Step the environment and move the masks to the infos.
+        Step the environment and convert its observations.
 
         :param actions: Actions by agent
         :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
-        obs, infos = self._split(obs, infos)
+        obs, infos = self._forms.convert(obs, infos)
         return obs, rewards, terminations, truncations, infos
-
-    def _split(self, obs: dict[str, Any], infos: dict[str, dict[str, Any]]) -> tuple[dict, dict]:
-        obs, infos = dict(obs), dict(infos)
-        for agent in self._masked:
-            if agent in obs:
-                mask = np.array(obs[agent]["action_mask"], dtype=bool)
-                mask[0] |= not mask.any()
-                obs[agent], infos[agent] = obs[agent]["observation"], {**infos.get(agent, {}), "action_mask": mask}
-        return obs, infos
 
 
 class Pursuit(Adapter):
@@ -253,7 +342,3 @@ class Pursuit(Adapter):
         cells = np.array([game.pursuer_layer.get_position(i) for i in range(len(self.possible_agents))])
         near = np.abs(cells[:, None] - cells[None]).max(axis=-1) <= game.obs_offset
         return {agent: np.delete(near[i], i) for i, agent in enumerate(self.possible_agents)}
-
-
-def _has_mask(space: spaces.Space) -> bool:
-    return isinstance(space, spaces.Dict) and set(space.spaces) == {"observation", "action_mask"}

@@ -15,6 +15,7 @@ from sb3_belief.team.agent_models import agent_seed
 from sb3_belief.team.fixed_partners.partners import CallersRng, Partner, PartnerLike
 from sb3_belief.vec_env.agent_vec_env import AgentStep, TransitionSplitter
 from sb3_belief.vec_env.joint_env import JointEnv, Visibility
+from sb3_belief.vec_env.observation_forms import map_parts, row_of
 from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 
 
@@ -103,7 +104,7 @@ class AgentEnv(gym.Env):
         self._callers_rng = CallersRng(0)
         self._seed: int | None = None
         self._partners: dict[str, Partner] = {}
-        self._obs: dict[str, np.ndarray] = {}
+        self._obs: dict[str, Any] = {}
         self._ended: dict[str, bool] = {}
         # Whether an episode of the learner is running, so that step() may be called
         self._running = False
@@ -149,7 +150,7 @@ class AgentEnv(gym.Env):
             self._seed_of(name),
         )
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
         Begin an episode of the learner.
 
@@ -170,9 +171,9 @@ class AgentEnv(gym.Env):
             self._obs = self._team_env.reset()
             self._ended = dict.fromkeys(self._agents, True)
         self._running, self._next_is_ready = True, False
-        return self._obs[self.agent][0], {}
+        return row_of(self._obs[self.agent], 0), {}
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
         Step the team, with actions of the partners for the other agents.
 
@@ -183,11 +184,13 @@ class AgentEnv(gym.Env):
         if not self._running:
             raise RuntimeError(f"The episode of {self.agent!r} is over, or none has begun: call reset() first.")
         team_over, team_info, (observations, rewards, dones, infos) = self._step_team(action)
-        obs, info = observations[0], infos[0]
+        obs, info = row_of(observations, 0), infos[0]
         terminated = truncated = False
         if dones[0]:
             # Removed from the info, because a vectorised environment around this one adds its own
-            obs, truncated = np.asarray(info.pop("terminal_observation"))[()], info.pop("TimeLimit.truncated")
+            # [()] makes a number of an array without dimensions, as that of a Discrete space
+            obs = map_parts(lambda last: np.asarray(last)[()], info.pop("terminal_observation"))
+            truncated = info.pop("TimeLimit.truncated")
             terminated = not truncated
             info.pop("episode", None)
             if not team_over and self.agent not in self._joint.agents_in_play:
@@ -244,7 +247,7 @@ class AgentEnv(gym.Env):
             for name, partner in self._partners.items():
                 partner.rng.resume()
                 mask = masks[name][0] if name in masks else None
-                actions[name] = partner.act(self._obs[name][0], self._ended[name], mask)[None]
+                actions[name] = partner.act(row_of(self._obs[name], 0), self._ended[name], mask)[None]
                 partner.rng.suspend()
         finally:
             self._callers_rng.resume()

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.common.rng import RngState, RngSwitch
-from sb3_belief.team.checkpoint import read_team
+from sb3_belief.team.checkpoint import as_models_see, read_team
 from sb3_belief.team.predictor import PolicyState, Predictor
 
 # That a partner was given no statistics, which is not the same as None
@@ -238,7 +238,7 @@ def _statistics(name: str, given: Any, observation_space: spaces.Space) -> VecNo
 def _check_spaces(name: str, model: Any, observation_space: spaces.Space, action_space: spaces.Space) -> None:
     for kind, wanted in (("observation", observation_space), ("action", action_space)):
         found = getattr(model, f"{kind}_space", wanted)
-        if found != wanted:
+        if found not in (wanted, as_models_see(wanted)):
             raise ValueError(
                 f"The partner {name!r} has been made for the {kind} space {found}, but {name!r} has {wanted} in this"
                 " environment."

@@ -9,7 +9,7 @@ from mpe2 import simple_spread_v3
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sb3_belief.envs import check_team_env, make_parallel_env, to_parallel
-from sb3_belief.envs.adapters.pettingzoo import Pursuit, SplitMasks, names
+from sb3_belief.envs.adapters.pettingzoo import ModelObservations, Pursuit, names
 from sb3_belief.team import make_team_env
 from tests.team.toy_envs import MixedEnv, ToyEnv
 
@@ -45,7 +45,7 @@ class MaskedObservations(ToyEnv):
 
 def test_masks_move_from_observations_to_infos():
     env: Any = to_parallel(MaskedObservations(3))
-    assert isinstance(env, SplitMasks) and env.unwrapped is env
+    assert isinstance(env, ModelObservations) and env.unwrapped is env
     assert env.observation_space("agent_0") == ToyEnv(3).observation_space("agent_0")
     assert env.limit == 7  # An attribute of the wrapped environment
     (obs, _), (plain, _) = env.reset(seed=1), ToyEnv(3).reset(seed=1)
@@ -54,9 +54,9 @@ def test_masks_move_from_observations_to_infos():
     for _ in range(3):
         *_, infos = env.step(dict.fromkeys(env.agents, 1))
         masks.append([infos[agent].get("action_mask", np.array([])).tolist() for agent in env.possible_agents])
-    first, second, third = np.eye(3, dtype=bool).tolist()
-    # Rows are steps 1 to 3. Where a mask allowed nothing, it now allows action 0
-    assert masks == [[second, third, []], [third, first, []], [first, first, []]]
+    _, second, third = np.eye(3, dtype=bool).tolist()
+    # Rows are steps 1 to 3. A mask that allows nothing stays so: a team finds out whether its agent could act
+    assert masks == [[second, third, []], [third, [False] * 3, []], [[False] * 3, [False] * 3, []]]
     assert [row.tolist() for row in env.visibility().values()] == [[False, False]] * 3
 
 

@@ -1,0 +1,69 @@
+"""Action masks as sb3-contrib's ``MaskablePPO`` takes them: one row of flags, those of all dimensions side by side."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+
+def mask_parts(space: spaces.Space) -> list[int]:
+    """
+    Return how many flags each dimension has in an action mask.
+
+    :param space: An action space
+    :return: The number of flags of each dimension, in order; none for a space that cannot be masked
+    """
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    if isinstance(space, spaces.MultiDiscrete):
+        return [int(n) for n in space.nvec.ravel()]
+    if isinstance(space, spaces.MultiBinary):
+        return [2] * int(np.prod(space.n))
+    return []
+
+
+def mask_width(space: spaces.Space) -> int:
+    """
+    Return the number of flags in an action mask.
+
+    :param space: An action space
+    :return: The number of flags; 0 for a space that cannot be masked
+    """
+    return sum(mask_parts(space))
+
+
+def first_actions(space: spaces.Space) -> np.ndarray:
+    """
+    Return the mask for an agent whose action counts for nothing: a model must choose one, so the first is left.
+
+    :param space: Its action space
+    :return: bool ``[mask_width(space)]``, True for the first value of each dimension
+    """
+    parts = mask_parts(space)
+    mask = np.zeros(sum(parts), dtype=bool)
+    mask[np.cumsum([0, *parts[:-1]])] = True
+    return mask
+
+
+def sample_action(space: spaces.Space, mask: np.ndarray | None, rng: np.random.Generator) -> Any:
+    """
+    Return a random action that a mask allows.
+
+    :param space: Action space
+    :param mask: Which actions are possible, bool. None if all are
+    :param rng: Random generator
+    :return: An action of the type that a team passes to an environment
+    """
+    if isinstance(space, spaces.Discrete):
+        return int(rng.choice(np.arange(space.n) if mask is None else np.flatnonzero(mask)))
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        sizes = np.full(space.shape, 2).ravel() if isinstance(space, spaces.MultiBinary) else space.nvec.ravel()
+        whole = np.ones(int(sizes.sum()), dtype=bool) if mask is None else mask
+        # A component without a possible action gets 0: the environment is to blame, and its own error is reported
+        parts = np.split(whole, np.cumsum(sizes)[:-1])
+        chosen = [rng.choice(np.flatnonzero(part)) if part.any() else 0 for part in parts]
+        return np.array(chosen, dtype=space.dtype).reshape(space.shape)
+    assert isinstance(space, spaces.Box)
+    # Bounds may be infinite, and a uniform draw needs finite ones
+    low, high = np.maximum(space.low, -1e3), np.minimum(space.high, 1e3)
+    return rng.uniform(low, high).astype(space.dtype)
