@@ -176,7 +176,8 @@ class BeliefAlgorithmMixin(_Algorithm):
         # SB3 accepts environments that return fewer infos than copies
         active, next_active = np.ones((2, self.n_envs), dtype=bool)
         active[: len(infos)] = [info.get("active", True) for info in infos]
-        next_active[: len(infos)] = [info.get("next_active", True) for info in infos]
+        # An environment that does not say who plays next is taken to go on as it is
+        next_active[: len(infos)] = [info.get("next_active", info.get("active", True)) for info in infos]
         if dones is not None and dones.any():
             for copy in np.flatnonzero(dones[: len(infos)] & ~next_active[: len(infos)]):
                 # The critic has no opinion of an agent that is out of play at the limit

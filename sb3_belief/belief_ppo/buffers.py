@@ -176,7 +176,7 @@ class BeliefBufferMixin(_Buffer):
     def stage(
         self,
         active: np.ndarray,
-        next_active: np.ndarray | bool = True,
+        next_active: np.ndarray | None = None,
         others_actions: np.ndarray | None = None,
         others_visible: np.ndarray | None = None,
     ) -> None:
@@ -184,12 +184,12 @@ class BeliefBufferMixin(_Buffer):
         Write what the environment says of a step into the row that ``add`` fills next.
 
         :param active: Whether the agent was in play when it acted, bool ``[n_envs]``
-        :param next_active: Whether it is in play after the step, bool ``[n_envs]``
+        :param next_active: Whether it is in play after the step, bool ``[n_envs]``; None if that is as in the step
         :param others_actions: float32 ``[n_envs, W]``, zero where not visible; None without a belief
         :param others_visible: bool ``[n_envs, n_others]``; None without a belief
         """
         self.active[self.pos] = active
-        self._next_active[:] = next_active
+        self._next_active[:] = active if next_active is None else next_active
         if others_actions is not None and others_visible is not None:
             self.others_actions[self.pos] = others_actions
             self.others_visible[self.pos] = others_visible
@@ -220,7 +220,7 @@ class BeliefBufferMixin(_Buffer):
         """
         dones = np.asarray(dones, dtype=bool)
         starts = self.episode_starts.astype(bool)
-        away = ~dones & ~(self.active[-1] & self._next_active)
+        away = ~dones & ~self._next_active
         if self.active.all() and not away.any():
             self._cut_returns.forget()
             return super().compute_returns_and_advantage(last_values, dones)

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_belief.vec_env.action_masks import first_actions, mask_parts, mask_width, sample_action
+from sb3_belief.vec_env.action_masks import first_actions, flat_mask, mask_parts, mask_width, sample_action
 from sb3_belief.vec_env.observation_forms import as_bytes
 from sb3_belief.vec_env.returned import plain_infos, plain_reset, plain_step
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
@@ -233,7 +233,9 @@ class RandomPlayer:
     def _as_bytes(self, obs: Mapping[str, Any], infos: Mapping[str, Any]) -> tuple:
         # Copies, because an environment may later write into the arrays that it returned
         observations = [as_bytes(obs[agent]) if agent in obs else b"" for agent in self.agents]
-        return observations, [[as_bytes(infos.get(agent, {}).get(key)) for key in KEYS[:-1]] for agent in self.agents]
+        told = [infos.get(agent, {}) for agent in self.agents]
+        masks = [flat_mask(info["action_mask"]).tobytes() if "action_mask" in info else b"" for info in told]
+        return observations, masks, [[as_bytes(info.get(key)) for key in KEYS[1:-1]] for info in told]
 
     def _check_agents(self, what: str, names: Any) -> bool:
         unknown = [name for name in names if name not in self.agents]
@@ -305,7 +307,7 @@ class RandomPlayer:
                     change = "give one at every step and at reset(), for the next action, or never"
                     record.fault("masks", f"none for {where}, though it had one before", change)
                 continue
-            mask, width = np.asarray(infos[agent]["action_mask"]).ravel(), self.mask_widths[agent]
+            mask, width = flat_mask(infos[agent]["action_mask"]), self.mask_widths[agent]
             if self.t and agent not in record.masked:
                 change = "give one at reset() too, for the first action"
                 record.fault("masks", f"the first one of {agent!r} comes at step {self.t}", change)

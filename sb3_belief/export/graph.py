@@ -116,8 +116,10 @@ class PolicyGraph(nn.Module):
         if self._extractor is None:
             features, believed = policy.pi_features_extractor(observation), {}
         else:
-            output = self._extractor.belief(flatten_observation(observation), context=self._context)
-            features = self._extractor.with_belief(self._extractor.features(observation), output)
+            own = self._extractor.features(observation)
+            flat = own if self._extractor.from_features else flatten_observation(observation)
+            output = self._extractor.belief(flat, context=self._context)
+            features = self._extractor.with_belief(own, output)
             believed = self._believed(output)
         distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(features))
         if mask is not None:

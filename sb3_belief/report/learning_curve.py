@@ -82,7 +82,7 @@ class Part(NamedTuple):
     end: float
 
 
-def parts_of(folder: str | os.PathLike[str]) -> list[Part]:
+def parts_of_run(folder: str | os.PathLike[str]) -> list[Part]:
     """
     Return the runs whose training a run continues, and the run itself.
 
@@ -129,7 +129,7 @@ def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarra
     :raises ValueError: If no episode has ended
     """
     read = []
-    for part in parts_of(folder):
+    for part in parts_of_run(folder):
         steps, returns, successes = read_monitor(part.folder)
         # A run that is continued from a checkpoint may have gone on itself
         kept = steps + part.start <= part.end
@@ -236,7 +236,7 @@ def plot_learning_curve(
     figure, axes = new_axes(title, "success" if of_success else "return")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
     label: str | None = "greedy, on other episodes"
-    for part in parts_of(folder):
+    for part in parts_of_run(folder):
         evaluations = read_evaluations(part.folder)
         if evaluations is not None:
             # SB3 counts the joint steps of evaluations on from those of the run before

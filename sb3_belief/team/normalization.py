@@ -1,5 +1,6 @@
 """The normalisation of an agent that is not in play all the time."""
 
+import copyreg
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,10 @@ class AgentNormalize(VecNormalize):
     def __reduce__(self) -> tuple[Any, ...]:
         # What VecNormalize.__getstate__() leaves out, which fails without an environment
         left_out = ("venv", "class_attributes", "returns")
-        return object.__new__, (VecNormalize,), {name: value for name, value in vars(self).items() if name not in left_out}
+        state = {name: value for name, value in vars(self).items() if name not in left_out}
+        # What pickle itself names where it means object.__new__. That method would be looked up by getattr, which no safe
+        # loader allows
+        return copyreg._reconstructor, (VecNormalize, object, None), state  # type: ignore[attr-defined]
 
     def step_wait(self) -> VecEnvStepReturn:
         """

@@ -32,6 +32,18 @@ def mask_width(space: spaces.Space) -> int:
     return sum(mask_parts(space))
 
 
+def flat_mask(mask: Any) -> np.ndarray:
+    """
+    Return a mask as one row.
+
+    :param mask: Flags as an array or a list, or those of each dimension in a tuple or list of arrays of different lengths
+    :return: The same flags side by side
+    """
+    if isinstance(mask, (tuple, list)):
+        mask = np.concatenate([np.ravel(part) for part in mask])
+    return np.asarray(mask).ravel()
+
+
 def first_actions(space: spaces.Space) -> np.ndarray:
     """
     Return the mask for an agent whose action counts for nothing: a model must choose one, so the first is left.

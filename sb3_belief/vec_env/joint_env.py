@@ -11,7 +11,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
-from sb3_belief.vec_env.action_masks import mask_width
+from sb3_belief.vec_env.action_masks import flat_mask, mask_width
 from sb3_belief.vec_env.events import Events, Flags, find_events, no_flags
 from sb3_belief.vec_env.observation_forms import ObservationForms, copied, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
@@ -345,7 +345,8 @@ class JointEnv(gym.Env):
         masks = []
         for agent in self.possible_agents:
             width = self._mask_widths[agent]
-            mask = np.asarray((infos.get(agent) or {}).get("action_mask", np.ones(width)), dtype=bool).ravel()
+            info = infos.get(agent) or {}
+            mask = flat_mask(info["action_mask"]).astype(bool) if "action_mask" in info else np.ones(width, dtype=bool)
             if width and mask.size != width:
                 raise ValueError(
                     f"The action mask of {agent!r} {self._where} must have {width} entries, one for each"

@@ -13,6 +13,9 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from torch import nn
 
+from sb3_belief.vec_env.action_masks import flat_mask
+from sb3_belief.vec_env.scripted_others import optional_member
+
 MASK = "action_mask"
 
 
@@ -60,6 +63,7 @@ class ObservationForms:
       single entry is the observation itself, several remain a ``Dict``.
     - A ``Tuple`` becomes a ``Dict`` with the keys ``"0"``, ``"1"``, ...
     - A nested ``Dict`` becomes one of a single level, whose keys are the joined ones: ``"sensors/camera"``.
+    - The masks that an environment's own ``action_masks()`` returns, {agent: mask}, go into the infos.
     - Keys that PyTorch does not take as names of modules (``"items"``, ``"a.b"``) are changed: ``"items_"``, ``"a_b"``.
 
     :param env: The environment
@@ -67,6 +71,7 @@ class ObservationForms:
     """
 
     def __init__(self, env: ParallelEnv):
+        self._action_masks = optional_member(env, "action_masks")
         #: Observation space of each agent in that form
         self.spaces: dict[str, spaces.Space] = {}
         self._forms: list[_Form] = []
@@ -94,8 +99,8 @@ class ObservationForms:
 
     @property
     def is_identity(self) -> bool:
-        """Whether all observations have that form already."""
-        return not self._forms
+        """Whether all observations have that form already, and all masks are in the infos."""
+        return not self._forms and self._action_masks is None
 
     def convert(self, obs: Mapping[str, Any], infos: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -104,9 +109,9 @@ class ObservationForms:
         :param obs: Observations by agent
         :param infos: Infos by agent
         :return: New observations and infos, by agent
-        :raises ValueError: If a part of an observation is missing
+        :raises ValueError: If a part of an observation is missing, or ``action_masks()`` returns something else
         """
-        obs, infos = dict(obs), dict(infos)
+        obs, infos = dict(obs), dict(infos or {})
         for form in self._forms:
             agent = form.agent
             if agent in obs:
@@ -116,8 +121,18 @@ class ObservationForms:
                             f"The observation of {agent!r} has no entry {MASK!r}: return what observation_space({agent!r})"
                             " declares, or correct the space."
                         )
-                    infos[agent] = {**(infos.get(agent) or {}), MASK: _as_row(obs[agent][MASK])}
+                    infos[agent] = {**(infos.get(agent) or {}), MASK: flat_mask(obs[agent][MASK]).astype(bool)}
                 obs[agent] = form.convert(obs[agent])
+        if self._action_masks is not None:
+            masks = self._action_masks()
+            if not isinstance(masks, Mapping):
+                raise ValueError(
+                    f"The environment's action_masks() returned a {type(masks).__name__}: it must return a mask for each agent"
+                    " that has one, {agent: mask}. Masks may also stand in infos[agent]['action_mask']."
+                )
+            for name, mask in masks.items():
+                agent = str(name)
+                infos[agent] = {MASK: flat_mask(mask).astype(bool), **(infos.get(agent) or {})}
         return obs, infos
 
 
@@ -137,11 +152,6 @@ def _name(path: tuple[Any, ...]) -> str:
     """Return the name of a part, which a module of its features extractor can have."""
     name = "/".join(map(str, path)).replace(".", "_")
     return f"{name}_" if name and hasattr(nn.ModuleDict, name) else name
-
-
-def _as_row(mask: Any) -> np.ndarray:
-    # The mask of a MultiDiscrete may be a tuple of arrays of different lengths
-    return np.array(np.concatenate([np.ravel(part) for part in mask]) if isinstance(mask, (tuple, list)) else mask, dtype=bool)
 
 
 def map_parts(function: Callable[..., Any], observation: Any, *others: Any) -> Any:

@@ -26,6 +26,8 @@ RESERVED = CONTRACT | {
     "truncated",
     "visible",
 }
+# What an agent's info may say of the agent alone
+_NOT_OF_THE_TEAM = frozenset(("next_active",))
 _NUMBERS = frozenset((int, float, bool, np.bool_, np.float64, np.float32, np.int64, np.int32, np.uint8, np.int8))
 _CONSTANTS = _NUMBERS | {str, type(None)}
 
@@ -54,6 +56,8 @@ def own_infos(infos: Mapping[str, Any], agents: Mapping[str, Any]) -> dict[str, 
             if own:
                 by_agent[name] = own
                 for key, value in own.items():
+                    if key in _NOT_OF_THE_TEAM:
+                        continue
                     if key in values:
                         values[key].append(value)
                     else:

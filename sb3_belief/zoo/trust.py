@@ -31,6 +31,7 @@ from sb3_belief.zoo.names import ALLOWED_PACKAGES, is_allowed
 _DATA = {
     "builtins": "bool bytearray bytes complex dict float frozenset int list object range set slice str tuple",
     "collections": "OrderedDict deque",
+    "copyreg": "_reconstructor",
     "numpy": "dtype ndarray",
     "numpy._core.multiarray numpy.core.multiarray": "_reconstruct scalar",
     "numpy._core.numeric numpy.core.numeric": "_frombuffer",

@@ -47,7 +47,7 @@ def play(game: str, n_steps: int, tells_next: bool = True, n_rollouts: int = 60,
             values = th.tensor(np.where(alive, v_alive[t], 1000.0))
             active, alive, t = alive, alive & (rng.random(n_envs) > risk), t + 1
             ends = t == LENGTH
-            buffer.stage(active, alive | ends if tells_next else True)
+            buffer.stage(active, alive | ends if tells_next else None)
             rewards = np.where(active, alive_pays, dead_pays)
             buffer.add(np.zeros((n_envs, 1)), np.zeros((n_envs, 1)), rewards, starts, values, th.zeros(n_envs))
             alive, t, starts = alive | ends, np.where(ends, 0, t), ends

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 
 from sb3_belief import AgentEnv, BeliefPPO, MaskableBeliefPPO
+from sb3_belief.belief_ppo import BeliefRolloutBuffer
 from sb3_belief.envs import check_team_env, to_parallel
 from tests.team.helpers import Team, make_team_env
 
@@ -102,6 +104,36 @@ def test_only_the_one_on_turn_is_active_and_seen():
     # Rows of visible: the others of each player. Whose turn it is not neither sees nor is seen
     assert infos[1]["visible"].tolist() == [[False, False], [False, False], [False, False]]
     assert infos[1]["agent_rewards"].tolist() == np.array([0, 0, 0.1], np.float32).tolist()
+
+
+def test_who_is_next_is_told_before():
+    infos = played(make_team_env(game), [0, 1, 0, 1, 0])
+    for before, after in pairwise(infos[:4]):
+        told = [before["agent_infos"][f"player_{i}"]["next_active"] for i in range(3)]
+        assert told == after["active"].tolist()
+        # A mean over the agents would say nothing
+        assert "next_active" not in before
+
+
+@pytest.mark.parametrize("n_steps", [24, 25])
+def test_nothing_is_bootstrapped_from_what_is_seen_off_turn(n_steps, monkeypatch):
+    """The critic's opinion of the last observation counts only for the player whose turn it is then."""
+    env = make_team_env(partial(game, n=2, stones=100))
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **{**KWARGS, "n_steps": n_steps, "batch_size": n_steps})
+    compute = BeliefRolloutBuffer.compute_returns_and_advantage
+    seen = []
+
+    def with_an_opinion(buffer, last_values, dones):
+        seen.append(buffer)
+        compute(buffer, th.full_like(last_values, 1e6), dones)
+
+    monkeypatch.setattr(BeliefRolloutBuffer, "compute_returns_and_advantage", with_an_opinion)
+    monkeypatch.setattr(BeliefPPO, "train", lambda model: None)
+    team.learn(n_steps)
+    # Whose turn it is after the rollout
+    on_turn = n_steps % 2
+    for i, buffer in enumerate(seen):
+        assert (np.abs(buffer.advantages[buffer.active]) > 1e3).any() == (i == on_turn)
 
 
 def test_the_steps_that_train_are_those_on_turn():

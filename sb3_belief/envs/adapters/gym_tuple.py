@@ -175,6 +175,10 @@ class GymTupleEnv(TeamGame[np.ndarray, Any]):
         if was_in_play is not self._everybody and not was_in_play.all():
             for info, active in zip(infos.values(), was_in_play, strict=True):
                 info["active"] = bool(active)
+        if self._in_play is not self._everybody and not self._in_play.all():
+            for info, active in zip(infos.values(), self._in_play, strict=True):
+                if not active:
+                    info["next_active"] = False
         if terminated or truncated:
             self.agents = []
             success = self._is_success()

@@ -256,7 +256,8 @@ class TurnBased(Adapter):
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
         infos = self._with_turns(infos)
         for agent in acted:
-            infos[agent] = {**infos.get(agent, {}), "active": agent == self._moved}
+            turns = {"active": agent == self._moved, "next_active": agent == self._aec.agent_selection}
+            infos[agent] = {**infos.get(agent, {}), **turns}
         return obs, rewards, terminations, truncations, infos
 
     def _with_turns(self, infos: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -141,6 +141,9 @@ class StarCraft(BattleGame[np.ndarray]):
         infos: dict[str, dict[str, Any]] = {
             agent: {"active": bool(alive[i]), "action_mask": self._masks[i]} for i, agent in enumerate(self.possible_agents)
         }
+        for agent, dead in zip(self.possible_agents, self._masks[:, NO_OP], strict=True):
+            if dead:
+                infos[agent]["next_active"] = False
         if ended:
             self.agents = []
             if not lost:

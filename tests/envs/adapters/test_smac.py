@@ -72,6 +72,7 @@ def test_who_dies_is_inactive_and_is_given_the_teams_reward(faults):
         assert len(set(rewards.values())) == 1 and env.team_reward(rewards) == rewards["agent_3"]
         assert all("life_end" not in info for info in infos.values())
         for i, agent in enumerate(env.possible_agents):
+            assert infos[agent].get("next_active", True) == (env.game.get_unit_by_id(i).health > 0)
             if env.game.get_unit_by_id(i).health <= 0:
                 assert not observations[agent].any() and not env.visibility()[agent].any()
                 assert infos[agent]["action_mask"].tolist() == [k == 0 for k in range(11)]

@@ -70,6 +70,7 @@ def test_no_impossible_action_is_sent_in_10000_steps():
             for i, agent in enumerate(env.possible_agents):
                 # Whether the unit was alive when it acted
                 assert infos[agent].get("active", True) == (i in alive)
+                assert infos[agent].get("next_active", True) == (i in env.game.agents)
                 mask = infos[agent]["action_mask"]
                 assert mask.dtype == bool and mask.shape == (env.action_space(agent).n,) and mask.any()
                 if i not in env.game.agents:

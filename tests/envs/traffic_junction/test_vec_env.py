@@ -159,7 +159,7 @@ def test_state_resumes_exactly():
         steps = [target.step(dict(zip(target.possible_agents, draw, strict=True))) for draw in draws]
         # All but the wall-clock time that the monitor writes
         return pickle.dumps(
-            [(o, r, d, [{**i, "episode": i.get("episode", {}).get("r")} for i in infos]) for o, r, d, infos in steps]
+            [(dict(o), r, d, [{**i, "episode": i.get("episode", {}).get("r")} for i in infos]) for o, r, d, infos in steps]
         )
 
     play(env, generator.integers(0, 2, size=(40, 10, 3)))

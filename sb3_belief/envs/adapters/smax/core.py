@@ -17,6 +17,7 @@ class BattleStep(NamedTuple):
     :param won: Whether it was won, bool [n]
     :param cut: Whether it ended by the step limit, bool [n]
     :param active: Whether each agent was alive when it acted, bool [n, A]
+    :param alive: Whether it is alive after the step, bool [n, A]
     :param visible: Whose action of this step each agent could observe, bool [n, A, A-1]
     """
 
@@ -25,6 +26,7 @@ class BattleStep(NamedTuple):
     won: np.ndarray
     cut: np.ndarray
     active: np.ndarray
+    alive: np.ndarray
     visible: np.ndarray
 
 
@@ -103,7 +105,7 @@ class Battles:
         self._keys, self._states, view, outcome = self._program.advance(self._keys, self._states, legal)
         self._set_view(view)
         rewards, ended, won, cut = (np.array(values) for values in outcome)
-        return BattleStep(rewards, ended, won, cut, active, np.array(view.visible))
+        return BattleStep(rewards, ended, won, cut, active, self._alive, np.array(view.visible))
 
     def _set_view(self, view: BattleView) -> None:
         # Copies, because arrays from jax are read-only, which PyTorch does not support

@@ -90,6 +90,8 @@ class Smax(BattleGame[np.ndarray]):
             agent: {"active": bool(result.active[0, i]), "action_mask": masks[i]}
             for i, agent in enumerate(self.possible_agents)
         }
+        for i in np.flatnonzero(~result.alive[0]):
+            infos[self.possible_agents[i]]["next_active"] = False
         if ended:
             self.agents = []
             for info in infos.values():

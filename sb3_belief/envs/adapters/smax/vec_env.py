@@ -81,6 +81,9 @@ class SmaxVecEnv(TeamVecEnv):
                 rewards, result.visible, result.active, result.ended.tolist(), result.cut.tolist(), strict=True
             )
         ]
+        for copy in np.flatnonzero(~result.alive.all(axis=1)):
+            dead = zip(self.possible_agents, result.alive[copy].tolist(), strict=True)
+            infos[copy]["agent_infos"] = {agent: {"next_active": False} for agent, alive in dead if not alive}
         obs = self._observe()
         ended = np.flatnonzero(result.ended)
         if len(ended):

@@ -244,6 +244,11 @@ def test_who_dies_stays_inactive_and_is_given_the_teams_reward(mixed):
             assert not info["visible"][dead[copy]].any()
             dead_steps += dead[copy].sum()
             rewarded += (info["agent_rewards"][dead[copy]] > 0).sum()
+            died = info.get("agent_infos", {})
+            assert dones[copy] or sorted(died) == [
+                mixed.possible_agents[i] for i in np.flatnonzero(~mixed.battles._alive[copy])
+            ]
+            assert all(told == {"next_active": False} for told in died.values())
         dead = ~mixed.battles._alive
     assert dead_steps > 0 and rewarded > 0
 

@@ -55,7 +55,7 @@ def test_a_batch_equals_single_copies_under_the_general_vectoriser(mixed):
     assert mixed.observation_space["ally_0"].shape == (9 * UNIT_FEATURES + OWN_FEATURES,)
     first, second = mixed.reset(), general.reset()
     generator = np.random.default_rng(0)
-    ends = 0
+    ends = died = 0
     for _ in range(150):
         masks, other_masks = mixed.action_masks(), general.action_masks()
         for agent in single.possible_agents:
@@ -73,12 +73,15 @@ def test_a_batch_equals_single_copies_under_the_general_vectoriser(mixed):
             for key in ("agent_rewards", "visible", "active", "life_end", "truncated"):
                 assert info[key].dtype == other[key].dtype
                 np.testing.assert_array_equal(info[key], other[key], err_msg=key)
+            # Who has just died, as the agents are told
+            assert info.get("agent_infos") == other.get("agent_infos")
+            died += len(info.get("agent_infos", {}))
             for key in ("is_success", "TimeLimit.truncated"):
                 assert info.get(key) is other.get(key)
             assert info.get("episode", {}).get("r") == other.get("episode", {}).get("r")
             for agent, values in info.get("terminal_observation", {}).items():
                 assert values.tobytes() == other["terminal_observation"][agent].tobytes()
-    assert ends >= 8
+    assert ends >= 8 and died > 20
 
 
 def test_a_copy_depends_on_its_own_seed_alone(mixed):
