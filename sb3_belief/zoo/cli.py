@@ -96,6 +96,10 @@ def _frame_rate(text: str) -> int:
 
 def _add_env_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"arguments of the environment: {_PAIRS}")
+    _add_allow_package(parser)
+
+
+def _add_allow_package(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--allow-package",
         **_LIST,
@@ -105,11 +109,15 @@ def _add_env_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    _add_env_options(parser)
+def _add_trust(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust", action="store_true", help="load a saved team even if it could run any code, because you know who made it"
     )
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    _add_env_options(parser)
+    _add_trust(parser)
     parser.add_argument("--device", default="auto", help="device of all models: auto, cpu, cuda, ...")
 
 
@@ -187,6 +195,8 @@ def _add_export(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--format", choices=["onnx", "torch"], default="onnx", help="format of the file")
     parser.add_argument("--output", help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder")
+    _add_allow_package(parser)
+    _add_trust(parser)
 
 
 def _add_envs(parser: argparse.ArgumentParser) -> None:
@@ -314,7 +324,7 @@ def _enjoy(args: argparse.Namespace, _: list[str]) -> int:
 def _export(args: argparse.Namespace, _: list[str]) -> int:
     from sb3_belief.zoo.export import export
 
-    export(args.agent, args.format, args.output)
+    export(args.agent, args.format, args.output, tuple(args.allow_package), args.trust)
     return 0
 
 

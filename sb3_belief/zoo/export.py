@@ -8,21 +8,35 @@ import torch as th
 from sb3_belief.export import FORMATS, export_model
 from sb3_belief.team.fixed_partners.partners import load_model
 from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.preflight import check_output
 from sb3_belief.zoo.run_folder import find_team, folder_name
+from sb3_belief.zoo.trust import check_saved_team
 
 
-def export(given: str, file_format: str, output: str | None = None) -> Path:
+def export(
+    given: str,
+    file_format: str,
+    output: str | None = None,
+    extra_packages: tuple[str, ...] = (),
+    trust: bool = False,
+) -> Path:
     """
     Export an agent, and print what the file takes and returns.
 
     :param given: ``"TEAM:agent"``, where TEAM is the zip of a team or the folder of a run, or the zip of a single agent
     :param file_format: A key of ``FORMATS``
     :param output: Path of the file; None for the agent's name in the current folder
+    :param extra_packages: See ``trust.check_saved_team``
+    :param trust: Whether to load a file even if it could run any code
     :return: Path of the file
     :raises ConfigError: If there is no such agent, or it cannot be exported
     """
+    if output is not None:
+        check_output(output, "--output")
     team, agent = _split(given)
     path = find_team(team, "export")
+    if not trust:
+        check_saved_team(path, "export", extra_packages, or_single_agent=True)
     try:
         if agent is not None and _is_single_agent(path):
             raise ConfigError(
@@ -31,7 +45,7 @@ def export(given: str, file_format: str, output: str | None = None) -> Path:
         model, statistics = load_model(path, agent or "")
         written = Path(output or folder_name(agent or path.stem) + FORMATS[file_format])
         graph = export_model(model, written, file_format, statistics)
-    except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
+    except (ValueError, TypeError, FileNotFoundError, ModuleNotFoundError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"export: {error}") from error

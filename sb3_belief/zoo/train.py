@@ -116,7 +116,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         stack.callback(env.close)
         config.check_agents(env.possible_agents)
         check_memory(config, env)
-        _check_masks(config, env)
+        _check_first_reset(config, env)
         eval_env = None
         if options.eval_freq > 0:
             eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
@@ -152,20 +152,17 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             return _learn(team, config, options, folder, record, callbacks)
 
 
-def _check_masks(config: RunConfig, env: TeamVecEnv) -> None:
-    """Check that agents that need action masks get some, which sb3-contrib does at the start of the training."""
-    classes = {agent: config.agent(agent).algo_class for agent in env.possible_agents}
-    masked = [agent for agent, algo_class in classes.items() if "action_masks" in signature(algo_class.predict).parameters]
-    if not masked:
-        return
+def _check_first_reset(config: RunConfig, env: TeamVecEnv) -> None:
+    """Check that the environment can be reset, and that agents that need action masks get some."""
     try:
         # The team seeds the environment once it is made, so that this reset changes nothing of the training
         env.reset()
         masks = env.action_masks() or {}
     except Exception as error:
         raise ConfigError(f"{config.source}: {config.env_id} cannot be reset: {cause(error)}") from error
-    for agent in masked:
-        if agent not in masks:
+    for agent in env.possible_agents:
+        takes_masks = "action_masks" in signature(config.agent(agent).algo_class.predict).parameters
+        if takes_masks and agent not in masks:
             name = config.agent(agent).algo
             raise ConfigError(
                 f"--algo: {name} needs action masks, and {config.env_id} gives {agent!r} none. Use"

@@ -79,19 +79,23 @@ class _Reader(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def check_saved_team(path: Path, where: str, extra_packages: tuple[str, ...] = ()) -> None:
+def check_saved_team(path: Path, where: str, extra_packages: tuple[str, ...] = (), or_single_agent: bool = False) -> None:
     """
     Check that loading a saved team runs no code but that of known packages.
 
     :param path: Zip of the team
     :param where: Flag or command that it was given to, for the error message
     :param extra_packages: Further packages that the user allows
+    :param or_single_agent: Whether the zip of a single SB3 model will do, too
     :raises ConfigError: If the file names anything else, or cannot be read. The message names the agent
     """
     agent = ""
     try:
         with zipfile.ZipFile(path) as team:
             if {"data", "policy.pth"} <= set(team.namelist()):
+                if or_single_agent:
+                    agent = path.stem
+                    return _check_model(path.read_bytes(), extra_packages)
                 raise ValueError("it is the zip of a single SB3 model, which its own class loads")
             for agent, class_name in json.loads(team.read("team.json"))["classes"].items():
                 module = str(class_name).partition(":")[0]

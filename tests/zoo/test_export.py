@@ -1,5 +1,9 @@
 """The command ``sb3-belief export``."""
 
+import base64
+import json
+import os
+import pickle
 import zipfile
 
 import onnxruntime
@@ -20,6 +24,34 @@ def run(tmp_path_factory):
     with zipfile.ZipFile(folder / "team.zip") as archive:
         archive.extract("agents/car_1.zip", folder)
     return folder
+
+
+class Evil:
+    """What a stranger's pickle may hold: a call of anything."""
+
+    def __reduce__(self):
+        return os.mkdir, ("made_by_code",)
+
+
+@pytest.fixture(scope="module")
+def evil(run, tmp_path_factory):
+    """The same run and agent from a stranger, with code of the stranger's in them."""
+    folder = tmp_path_factory.mktemp("evil")
+    rewrite(run / "agents" / "car_1.zip", folder / "car_1.zip", "data", with_code)
+    agent = (folder / "car_1.zip").read_bytes()
+    rewrite(run / "team.zip", folder / "team.zip", "agents/car_1.zip", lambda _: agent)
+    return folder
+
+
+def with_code(data):
+    pickled = base64.b64encode(pickle.dumps(Evil())).decode()
+    return json.dumps({**json.loads(data), "lr_schedule": {":type:": "x", ":serialized:": pickled}}).encode()
+
+
+def rewrite(path, target, name, change):
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(target, "w") as changed:
+        for each in archive.namelist():
+            changed.writestr(each, change(archive.read(each)) if each == name else archive.read(each))
 
 
 def test_an_agent_is_written_where_one_is(run, tmp_path, monkeypatch, capsys):
@@ -54,9 +86,12 @@ def test_a_single_agents_zip_will_do(run, tmp_path):
         ("{run}/agents/car_1.zip:car_1", [], "is the zip of a single agent"),
         ("nowhere:car_1", [], "no file or folder 'nowhere:car_1'"),
         ("{run}:car_1", ["--output", "car.pt2"], "end it in .onnx"),
+        ("{run}:car_1", ["--output", "/proc/car.onnx"], "--output: cannot write the file"),
+        ("{evil}:car_1", [], "'car_1' needs 'posix.mkdir', which could run any code"),
+        ("{evil}/car_1.zip", [], "'car_1' needs 'posix.mkdir', which could run any code"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(run, tmp_path, monkeypatch, capsys, given, options, message):
+def test_what_cannot_be_exported_is_refused(run, evil, tmp_path, monkeypatch, capsys, given, options, message):
     monkeypatch.chdir(tmp_path)
-    assert main(["export", given.format(run=run), *options]) == 2
+    assert main(["export", given.format(run=run, evil=evil), *options]) == 2
     assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
