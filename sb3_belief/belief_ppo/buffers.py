@@ -194,6 +194,23 @@ class BeliefBufferMixin(_Buffer):
             self.others_actions[self.pos] = others_actions
             self.others_visible[self.pos] = others_visible
 
+    def watch(self, starts: np.ndarray, owners: np.ndarray) -> None:
+        """
+        Write what the agent has seen of others while it waited into the row of its last active step. So that row holds what
+        each of them did from the agent's turn to its next one: the first action that it saw.
+
+        :param starts: Whether a return starts with the step that was staged, bool ``[n_envs]``
+        :param owners: To which other each column of ``others_actions`` belongs, int ``[W]``
+        """
+        for copy in np.flatnonzero(~self.active[self.pos] & self.others_visible[self.pos].any(axis=1)):
+            played = np.flatnonzero(self.active[: self.pos, copy])
+            if len(played) == 0 or starts[copy] or self.episode_starts[played[-1] + 1 : self.pos, copy].any():
+                continue
+            row = played[-1], copy
+            new = self.others_visible[self.pos, copy] & ~self.others_visible[row]
+            self.others_visible[row] |= new
+            self.others_actions[row] += self.others_actions[self.pos, copy] * new[owners]
+
     def add(self, *args: Any, **kwargs: Any) -> None:
         """
         Add a step as SB3 does, with the :class:`SampledLatents` that the policy has attached to its values.

@@ -132,7 +132,8 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
             visible, as in ``info["others_actions"]``
         :param visible: ``{name: bool [N]}``, at which of the steps each other was visible; at all of them if it is left out.
             What stands in ``actions`` at the other steps is ignored
-        :raises ValueError: If a name is unknown, or something is not of this shape or no action of its space
+        :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
+            is not finite
         """
         if self.history is None:
             return
@@ -140,6 +141,11 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         with th.inference_mode(False), th.no_grad():
             # obs_to_tensor() accepts images with the channels last, as the environment returns them
             rows = self.flat_observations(self.obs_to_tensor(observations)[0])
+            if not bool(th.isfinite(rows).all()):
+                raise ValueError(
+                    "observations to remember hold a number that is not finite: attention to such a row would make all later "
+                    "actions NaN; leave these steps out"
+                )
             encoded = others_rows(self.others_action_spaces, actions, visible, len(rows))
             self._extractor.remember(rows, th.as_tensor(encoded, device=self.device))
 

@@ -1,6 +1,8 @@
 """Checks and conversions of what a user gives a ``Team``."""
 
+import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 from pettingzoo import ParallelEnv
@@ -74,6 +76,17 @@ def per_agent(name: str, given: Any, agents: Sequence[str]) -> dict[str, Any]:
     if missing:
         raise ValueError(f"{name} has no entry for {missing}; it needs one for each of {list(agents)}, or one value for all.")
     return {agent: given[agent] for agent in agents}
+
+
+def check_total_timesteps(total_timesteps: Any) -> None:
+    """
+    Check a number of joint steps.
+
+    :param total_timesteps: What the user gave to ``learn``
+    :raises ValueError: If it is no finite number of at least 0: a team would learn nothing, or for ever
+    """
+    if isinstance(total_timesteps, bool) or not isinstance(total_timesteps, Real) or not 0 <= total_timesteps < math.inf:
+        raise ValueError(f"total_timesteps is {total_timesteps!r}; it must be a number of joint steps of at least 0.")
 
 
 def check_agent_keys(name: str, given: Mapping[str, Any], agents: Sequence[str]) -> None:

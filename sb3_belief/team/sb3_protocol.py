@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_belief.team.arguments import check_agent_keys
+from sb3_belief.team.arguments import check_agent_keys, check_total_timesteps
 from sb3_belief.team.checkpoint import read_team
 
 # Arguments of algorithms that a team has itself
@@ -120,12 +120,15 @@ class SB3Protocol:
             for name in common:
                 vars(self).pop(name, None)
 
-    def check_nothing_set(self) -> None:
+    def check_learn(self, total_timesteps: Any) -> None:
         """
-        Check that nothing was set on the team that only its models could use.
+        Check what a ``learn`` of SB3 does not.
 
-        :raises ValueError: If an argument of the algorithms was set on the team
+        :param total_timesteps: What the user gave to ``learn``
+        :raises ValueError: If it is no finite number of at least 0, or an argument of the algorithms was set on the team,
+            which only its models could use
         """
+        check_total_timesteps(total_timesteps)
         for name in sorted(self._shared_names().intersection(vars(self))):
             raise ValueError(
                 f"team.{name} was set, but the models are the agents' own: set it on each model of team.agents, or load them"

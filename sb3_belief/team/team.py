@@ -5,7 +5,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, TypeVar
 
@@ -204,7 +204,7 @@ class Team(SB3Protocol):
         own_callbacks = agent_callbacks or {}
         team_callback = as_callback(callback, progress_bar)
         check_callbacks(self._models, bool(self._agents.statistics), team_callback, own_callbacks)
-        self.check_nothing_set()
+        self.check_learn(total_timesteps)
         with self._exclusively():
             log = self._make_log(tb_log_name)
             if reset_num_timesteps:
@@ -276,7 +276,9 @@ class Team(SB3Protocol):
         :raises ValueError: If an agent is unknown
         """
         self._parallel.sync_models()
-        return self._predictor.predict(observation, state, episode_start, deterministic, action_masks)
+        # While a team learns, its policies are in the hands of one thread
+        with global_rngs_of_this_thread() if self._learning else nullcontext():
+            return self._predictor.predict(observation, state, episode_start, deterministic, action_masks)
 
     @property
     def takes_masks(self) -> bool:

@@ -111,7 +111,8 @@ class JointEnv(gym.Env):
             says, self._team_reward = user_env.renamed_members(says, self._team_reward)
         #: Whether the environment reports ``is_success``, as far as can be known before it does
         self.reports_success = reports_success(env)
-        self._others = VisibleOthers(self.possible_agents, list(self.scripted_action_spaces), says)
+        watches = says is not None and bool(optional_member(env, "observe_while_inactive"))
+        self._others = VisibleOthers(self.possible_agents, list(self.scripted_action_spaces), says, watches)
         self._zero_obs = {agent: zeros_in(space) for agent, space in self.observation_spaces.items()}
         # Set at the first info that holds an action mask
         self._has_masks = False

@@ -137,9 +137,12 @@ class ParallelTeamVecEnv(TeamVecEnv):
         return obs
 
     def _step_joint(self, actions: TeamObs) -> TeamStep:
-        # Plain integers for Discrete: what PettingZoo environments are tested with
+        # Plain integers for Discrete: what PettingZoo environments are tested with. Copies of others: an environment may write
+        # into them, and the models keep theirs
         columns = [
-            (self._checks.check_discrete if discrete else self._checks.check_vectors)(agent, actions[agent], self._lengths)
+            self._checks.check_discrete(agent, actions[agent], self._lengths)
+            if discrete
+            else self._checks.check_vectors(agent, actions[agent], self._lengths).copy()
             for agent, discrete in zip(self.possible_agents, self._discrete, strict=True)
         ]
         joint_actions: Any = [dict(zip(self.possible_agents, row)) for row in zip(*columns)]  # noqa: B905 (lengths are checked)

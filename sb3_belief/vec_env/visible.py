@@ -15,9 +15,18 @@ class VisibleOthers:
     :param agents: Names of the agents
     :param scripted: Names of the scripted others
     :param visibility: The environment's ``visibility()``; None if all agents in play observe each other
+    :param while_inactive: Whether agents observe others also in steps in which they are inactive, because they wait for their
+        turn. The environment's ``visibility()`` says whether they are there at all
     """
 
-    def __init__(self, agents: Sequence[str], scripted: Sequence[str], visibility: Callable[[], Any] | None):
+    def __init__(
+        self,
+        agents: Sequence[str],
+        scripted: Sequence[str],
+        visibility: Callable[[], Any] | None,
+        while_inactive: bool = False,
+    ):
+        self._while_inactive = while_inactive
         self._agents, self._scripted, self._visibility = list(agents), list(scripted), visibility
         everyone = range(len(agents) + len(scripted))
         # Row i lists the others of agent i: the other agents in order, then the scripted others
@@ -41,12 +50,11 @@ class VisibleOthers:
         :return: bool ``[n, n_others]``
         :raises ValueError: If ``visibility()`` returns something else than flags by agent
         """
-        # An inactive agent neither observes nor is observed. Scripted others count as in play; an environment in which they
-        # cannot always be observed says so by its visibility()
-        if self._scripted:
-            in_play = np.concatenate([active, self._scripted_in_play])[self._others] & active[:, None]
-        else:
-            in_play = active[self._others] & active[:, None]
+        # An inactive agent is not observed, and mostly observes nobody. Scripted others count as in play; an environment in
+        # which they cannot always be observed says so by its visibility()
+        in_play = np.concatenate([active, self._scripted_in_play])[self._others] if self._scripted else active[self._others]
+        if not self._while_inactive:
+            in_play = in_play & active[:, None]
         if self._visibility is None:
             return in_play
         rows = self._visibility()

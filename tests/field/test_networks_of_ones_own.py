@@ -107,3 +107,13 @@ def test_what_is_remembered_in_inference_mode_can_be_trained_on(algorithm):
     assert int(model.policy.history.valid.sum()) == 20
     model.learn(3 * 42)
     assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_what_is_not_finite_is_not_remembered(number):
+    policy = make_model().policy
+    observations = np.zeros((3, 5), dtype=np.float32)
+    observations[1, 2] = number
+    with pytest.raises(ValueError, match="not finite"):
+        policy.remember(observations, np.zeros((3, 7), dtype=np.float32))
+    assert not policy.history.valid.any()

@@ -108,6 +108,22 @@ def in_thread(call):
     return next(iter(raised), None), next(iter(returned), None)
 
 
+def test_a_team_that_learns_does_not_predict_in_another_thread():
+    team, errors = unseeded(PPO, n_steps=8, batch_size=8), []
+    observations = {agent: space.sample() for agent, space in team.observation_space.spaces.items()}
+
+    class Predicts(BaseCallback):
+        def _on_step(self):
+            errors.append(in_thread(lambda: team.predict(observations))[0])
+            # In the thread that learns it may
+            team.predict(observations)
+            return True
+
+    team.learn(16, callback=Predicts())
+    assert errors and all(isinstance(error, RuntimeError) and "Another thread" in str(error) for error in errors)
+    assert in_thread(lambda: team.predict(observations))[0] is None
+
+
 @pytest.mark.parametrize("algorithm, kwargs", [(PPO, PPO_KWARGS), (DQN, {"learning_starts": 4})])
 def test_two_teams_in_threads_are_refused(algorithm, kwargs, tmp_path):
     second = unseeded(algorithm, log_dir=str(tmp_path / "second"), **kwargs)

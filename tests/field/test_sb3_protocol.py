@@ -227,3 +227,11 @@ def test_one_agent_is_evaluated_among_its_teammates(tmp_path):
     assert th.equal(*runs)
     with pytest.raises(ValueError, match=r"of 'agent_0'.*one agent is evaluated in an AgentEnv\(parallel_env, 'agent_0'"):
         team.learn(16, agent_callbacks={"agent_0": evaluation(make_team_env(ToyEnv))})
+
+
+@pytest.mark.parametrize("steps", [float("inf"), float("nan"), -1, True, "64"])
+def test_a_number_of_steps_that_never_ends_or_begins_is_refused(steps):
+    team = make_team()
+    with pytest.raises(ValueError, match=r"total_timesteps is .*; it must be a number of joint steps of at least 0"):
+        team.learn(steps)
+    assert team.num_timesteps == 0

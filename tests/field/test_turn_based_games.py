@@ -11,6 +11,7 @@ from gymnasium import spaces
 from pettingzoo import AECEnv
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief import AgentEnv, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.belief_ppo import BeliefRolloutBuffer
@@ -101,9 +102,56 @@ def test_only_the_one_on_turn_is_active_and_seen():
         [False, False, True],
         [True, False, False],
     ]
-    # Rows of visible: the others of each player. Whose turn it is not neither sees nor is seen
-    assert infos[1]["visible"].tolist() == [[False, False], [False, False], [False, False]]
+    # Rows of visible: the others of each player. All who wait see the one whose turn it is
+    assert infos[1]["visible"].tolist() == [[True, False], [False, False], [False, True]]
     assert infos[1]["agent_rewards"].tolist() == np.array([0, 0, 0.1], np.float32).tolist()
+
+
+@pytest.mark.parametrize("n_steps", [24, 23])
+def test_a_belief_learns_from_what_others_do_between_two_turns(n_steps):
+    env = make_team_env(partial(game, n=3, stones=14), n_envs=2)
+    kwargs = {**KWARGS, "n_steps": n_steps, "batch_size": n_steps}
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **kwargs)
+    played = []
+
+    class Watches(BaseCallback):
+        """Collects who moved in which way in each copy, and where episodes ended."""
+
+        def _on_step(self):
+            actions, infos = self.locals["actions"], self.locals["infos"]
+            moves = [info["active"].argmax() for info in infos]
+            taken = [int(actions[f"player_{moved}"][copy]) for copy, moved in enumerate(moves)]
+            played.append((moves, taken, list(self.locals["dones"])))
+            return True
+
+    team.learn(2 * n_steps, callback=Watches())
+    seen = 0
+    for i, model in enumerate(team.agents.values()):
+        buffer, others = model.rollout_buffer, [j for j in range(3) if j != i]
+        for copy, t in np.ndindex(2, n_steps):
+            # The first get() of the update has put the copies one after the other
+            row = copy * n_steps + t
+            if not buffer.active[row]:
+                continue
+            expected = np.zeros((2, 2), np.float32)
+            for s in range(t + 1, n_steps):
+                moves, taken, _ = played[s]
+                if played[s - 1][2][copy] or moves[copy] == i:
+                    break
+                expected[others.index(moves[copy]), taken[copy]] = 1.0
+            assert buffer.others_actions[row].tolist() == expected.ravel().tolist()
+            assert buffer.others_visible[row].tolist() == expected.any(axis=1).tolist()
+            seen += int(expected.sum())
+        assert np.isfinite(model.logger.name_to_value["belief/action_loss"])
+        assert model.policy.history.actions.sum() > 0
+    assert seen > 20
+
+
+def test_who_is_out_of_the_game_sees_nobody():
+    env = make_team_env(partial(game, stones=20, out=True))
+    infos = played(env, [1, 1, 0, 0, 0, 0])
+    gone = [info for info in infos if not info["agent_infos"].get("player_0")]
+    assert gone and not any(info["visible"][0].any() for info in gone)
 
 
 def test_who_is_next_is_told_before():

@@ -228,10 +228,14 @@ class TurnBased(Adapter):
     :param env: The AEC environment
     """
 
+    #: Who waits for its turn watches
+    observe_while_inactive = True
+
     def __init__(self, env: AECEnv):
         super().__init__(in_model_form(_Turns(env)))
         self._aec = env
         self._moved = ""
+        self._watched: list[str] = []
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """
@@ -241,7 +245,7 @@ class TurnBased(Adapter):
         :param options: Passed on to the environment
         :return: Observations and infos, by agent
         """
-        self._moved = ""
+        self._moved, self._watched = "", []
         obs, infos = self.env.reset(seed=seed, options=options)
         return obs, self._with_turns(infos)
 
@@ -255,6 +259,7 @@ class TurnBased(Adapter):
         acted, self._moved = list(self.agents), self._aec.agent_selection
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
         infos = self._with_turns(infos)
+        self._watched = acted
         for agent in acted:
             turns = {"active": agent == self._moved, "next_active": agent == self._aec.agent_selection}
             infos[agent] = {**infos.get(agent, {}), **turns}
@@ -272,11 +277,11 @@ class TurnBased(Adapter):
         """
         Return which other agent had its turn in the last step, since no other agent's action counted.
 
-        :return: {agent: bool [n_others]}
+        :return: {agent: bool [n_others]} of those who were in the game
         """
         return {
             agent: np.array([other == self._moved for other in self.possible_agents if other != agent], dtype=bool)
-            for agent in self.possible_agents
+            for agent in self._watched
         }
 
 
