@@ -187,7 +187,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         others = read_others(infos, self.policy.layout) if self._has_belief else ()
         self.rollout_buffer.stage(active, next_active, *others)
         if others and not active.all():
-            self.rollout_buffer.watch(np.asarray(self._last_episode_starts), self.policy.layout.owners)
+            self.rollout_buffer.watch(np.asarray(self._last_episode_starts), np.asarray(self.policy.layout.owners))
 
     # -- update --------------------------------------------------------------------------------------------------------
 

@@ -85,7 +85,8 @@ def check_total_timesteps(total_timesteps: Any) -> None:
     :param total_timesteps: What the user gave to ``learn``
     :raises ValueError: If it is no finite number of at least 0: a team would learn nothing, or for ever
     """
-    if isinstance(total_timesteps, bool) or not isinstance(total_timesteps, Real) or not 0 <= total_timesteps < math.inf:
+    is_number = isinstance(total_timesteps, Real) and not isinstance(total_timesteps, bool)
+    if not (is_number and 0 <= float(total_timesteps) < math.inf):
         raise ValueError(f"total_timesteps is {total_timesteps!r}; it must be a number of joint steps of at least 0.")
 
 

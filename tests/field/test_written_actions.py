@@ -12,7 +12,7 @@ from tests.team.helpers import Team, make_team_env
 class WritesIntoActions(Walkers):
     """An environment that uses the arrays of the actions for its own calculations."""
 
-    act_space = spaces.MultiDiscrete([3, 3])
+    act_space: spaces.Space = spaces.MultiDiscrete([3, 3])
 
     def step(self, actions):
         for action in actions.values():
