@@ -1,5 +1,6 @@
 """The command ``sb3-belief export``: one agent of a team as a file that runs without this package."""
 
+import json
 import zipfile
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import torch as th
 
 from sb3_belief.export import FORMATS, export_model
 from sb3_belief.team.fixed_partners.partners import load_model
-from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.errors import ConfigError, cause, suggestion
 from sb3_belief.zoo.preflight import check_output
 from sb3_belief.zoo.run_folder import find_team, folder_name
 from sb3_belief.zoo.trust import check_saved_team
@@ -35,20 +36,23 @@ def export(
         check_output(output, "--output")
     team, agent = _split(given)
     path = find_team(team, "export")
+    agents = _agents_of(path)
+    if agents is None and agent is not None:
+        raise ConfigError(f"export: {str(path)!r} is the zip of a single agent, so it has no {agent!r}. Leave out ':{agent}'.")
+    if agents is not None and agent not in agents:
+        unknown = "name" if agent is None else f"{str(path)!r} has no agent {agent!r}.{suggestion(agent, agents)} Name"
+        raise ConfigError(f"export: {unknown} the agent: {team}:agent, one of {agents}.")
     if not trust:
         check_saved_team(path, "export", extra_packages, or_single_agent=True)
     try:
-        if agent is not None and _is_single_agent(path):
-            raise ConfigError(
-                f"export: {str(path)!r} is the zip of a single agent, so it has no {agent!r}. Leave out ':{agent}'."
-            )
         model, statistics = load_model(path, agent or "")
         written = Path(output or folder_name(agent or path.stem) + FORMATS[file_format])
         graph = export_model(model, written, file_format, statistics)
-    except (ValueError, TypeError, FileNotFoundError, ModuleNotFoundError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"export: {error}") from error
+    # A damaged file makes zipfile, pickle and torch raise whatever they raise, when it is read or when it is traced
+    except Exception as error:
+        # The message of a missing package is the line that installs it
+        reason = str(error) if isinstance(error, ModuleNotFoundError) else cause(error)
+        raise ConfigError(f"export: {str(path)!r}{'' if agent is None else f', agent {agent!r}'}: {reason}") from error
     inputs = graph.examples(1)
     print(f"Wrote {written} ({written.stat().st_size / 1024:.0f} KiB). For any number of observations B:")
     for name, tensor in zip(graph.input_names, inputs, strict=True):
@@ -67,11 +71,14 @@ def _split(given: str) -> tuple[str, str | None]:
     return team, agent
 
 
-def _is_single_agent(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return "team.json" not in archive.namelist()
+def _agents_of(path: Path) -> list[str] | None:
+    """Return the agents of a saved team, or None for another zip."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [*json.loads(archive.read("team.json"))["agents"]] if "team.json" in archive.namelist() else None
+    # A damaged file makes zipfile, zlib and json raise whatever they raise
+    except Exception as error:
+        raise ConfigError(f"export: {str(path)!r} is no saved team, or damaged ({cause(error)})") from error
 
 
 def _shown(tensor: th.Tensor) -> str:

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from sb3_belief.team import TeamVecEnv
 from sb3_belief.zoo.config import AgentConfig, RunConfig
-from sb3_belief.zoo.errors import ConfigError, reason_of, short
+from sb3_belief.zoo.errors import ConfigError, reason_of, short, shorten
 
 _GB = 1e9
 # Least memory of a copy of an environment, in bytes: the objects of one in this process, and a Python with numpy in a worker
@@ -136,6 +136,36 @@ def check_memory(config: RunConfig, env: TeamVecEnv) -> None:
             f"{config.origin(name)}: the models need about {needed / _GB:,.0f} GB of memory, and this machine has"
             f" {total_memory() / _GB:,.0f} GB. Lower {name!r}, of which {agent} alone needs {largest[name] / _GB:,.1f} GB."
         )
+
+
+def check_eval_env(config: RunConfig, env: TeamVecEnv, eval_env: TeamVecEnv) -> None:
+    """
+    Check that a team can act in the environment of its evaluations.
+
+    :param config: Configuration of the team
+    :param env: Environment in which it learns
+    :param eval_env: Environment of its evaluations
+    :raises ConfigError: If agents or spaces differ. Bounds of observations may, since no model depends on them
+    """
+    trained, evaluated = env.possible_agents, eval_env.possible_agents
+    differing = f"the agents {trained} learn, and evaluations have {evaluated}" if set(trained) != set(evaluated) else ""
+    for agent in [] if differing else trained:
+        for kind in ("observation", "action"):
+            own, other = (cast("spaces.Dict", getattr(each, f"{kind}_space"))[agent] for each in (env, eval_env))
+            if not differing and (own != other if kind == "action" else _form(own) != _form(other)):
+                differing = shorten(f"the {kind} space of {agent!r} is {own} in training and {other} in evaluations")
+    if differing:
+        raise ConfigError(
+            f"{config.origin('eval_env_kwargs:')}: eval_env_kwargs: {differing}, in which the team cannot act: evaluations need"
+            " the agents and spaces of the training."
+        )
+
+
+def _form(space: spaces.Space) -> Any:
+    """Return what a network depends on of an observation space."""
+    if isinstance(space, spaces.Dict):
+        return {key: _form(part) for key, part in space.items()}
+    return (space.shape, space.dtype) if isinstance(space, spaces.Box) else space
 
 
 def total_memory() -> float:

@@ -18,7 +18,7 @@ from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause
-from sb3_belief.zoo.preflight import check_copies, check_device, check_folder, check_memory
+from sb3_belief.zoo.preflight import check_copies, check_device, check_eval_env, check_folder, check_memory
 from sb3_belief.zoo.run_folder import (
     CHECKPOINTS,
     CONFIG,
@@ -122,6 +122,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
             eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
             eval_env = make_env(eval_config, options.n_eval_envs, env_seed(seed, purpose=1), "dummy")
             stack.callback(eval_env.close)
+            check_eval_env(config, env, eval_env)
         # The team opens its logs in the folder, so the folder must exist first. It is removed again if the team is refused
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:

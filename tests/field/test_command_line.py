@@ -248,6 +248,25 @@ def test_evaluations_may_have_another_environment(tmp_path, monkeypatch):
         load_config("ppo", "convention-swap", eval_env_kwargs=["x:1"])
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["mpe/simple_spread_v3", "--eval-env-kwargs", "N:4"],
+            "--eval-env-kwargs: eval_env_kwargs: the agents ['agent_0', 'agent_1', 'agent_2'] learn, and evaluations have"
+            " ['agent_0', 'agent_1', 'agent_2', 'agent_3']",
+        ),
+        (["convention-swap", "--eval-env-kwargs", "m:5"], "--eval-env-kwargs: eval_env_kwargs: the observation space of"),
+        (["convention-swap", "-params", "eval_env_kwargs.m:5"], "-params: eval_env_kwargs: the observation space of"),
+        (["convention-swap", "--conf-file", "mine.yml"], "mine.yml, section default: eval_env_kwargs: the observation space"),
+    ],
+)
+def test_evaluations_have_the_agents_and_spaces_of_the_training(words, message, tmp_path, monkeypatch, capsys):
+    (tmp_path / "mine.yml").write_text("default: {n_timesteps: 8, policy: MlpPolicy, eval_env_kwargs: {m: 5}}\n")
+    said = refused(["train", "--algo", "ppo", "--env", *words], tmp_path, monkeypatch, capsys)
+    assert message in said and "evaluations" in said
+
+
 GAMES = """
 from sb3_belief.envs import register
 from tests.team.toy_envs import ToyEnv

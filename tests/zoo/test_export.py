@@ -4,7 +4,9 @@ import base64
 import json
 import os
 import pickle
+import tempfile
 import zipfile
+from pathlib import Path
 
 import onnxruntime
 import pytest
@@ -81,8 +83,9 @@ def test_a_single_agents_zip_will_do(run, tmp_path):
 @pytest.mark.parametrize(
     ("given", "options", "message"),
     [
-        ("{run}", [], "is a team of ['car_0', 'car_1', 'car_2', 'car_3', 'car_4'], without ''"),
-        ("{run}:car_9", [], "without 'car_9'"),
+        ("{run}", [], "Refused: export: name the agent: {run}:agent, one of ['car_0', 'car_1', 'car_2', 'car_3', 'car_4']"),
+        ("{run}/team.zip", [], "name the agent: {run}/team.zip:agent, one of ['car_0'"),
+        ("{run}:car_9", [], "has no agent 'car_9'. Did you mean"),
         ("{run}/agents/car_1.zip:car_1", [], "is the zip of a single agent"),
         ("nowhere:car_1", [], "no file or folder 'nowhere:car_1'"),
         ("{run}:car_1", ["--output", "car.pt2"], "end it in .onnx"),
@@ -94,4 +97,52 @@ def test_a_single_agents_zip_will_do(run, tmp_path):
 def test_what_cannot_be_exported_is_refused(run, evil, tmp_path, monkeypatch, capsys, given, options, message):
     monkeypatch.chdir(tmp_path)
     assert main(["export", given.format(run=run, evil=evil), *options]) == 2
-    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+    assert message.format(run=run) in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+
+
+def changed_data(**changes):
+    return lambda data: json.dumps({**json.loads(data), **changes}).encode()
+
+
+def changed_model(change, name="data"):
+    def changed(content):
+        with tempfile.TemporaryDirectory() as folder:
+            Path(folder, "a.zip").write_bytes(content)
+            rewrite(Path(folder, "a.zip"), Path(folder, "b.zip"), name, change)
+            return Path(folder, "b.zip").read_bytes()
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("team.json", lambda _: b"[1]"),
+        ("team.json", lambda data: data[:40]),
+        ("team.json", changed_data(agents=3)),
+        ("team.json", changed_data(classes=["x"])),
+        ("team.json", changed_data(classes={"car_1": "torch.nn:Linear"})),
+        ("agents/car_1.zip", lambda data: data[:99]),
+        ("agents/car_1.zip", changed_model(lambda _: b"[1]")),
+        ("agents/car_1.zip", changed_model(lambda _: b"{}")),
+        ("agents/car_1.zip", changed_model(changed_data(observation_space=None))),
+        ("agents/car_1.zip", changed_model(changed_data(policy_kwargs=[1]))),
+        ("agents/car_1.zip", changed_model(changed_data(policy_kwargs={"net_arch": "x"}))),
+        ("agents/car_1.zip", changed_model(changed_data(history_length="x"))),
+        ("agents/car_1.zip", changed_model(changed_data(policy_class={":type:": "x", ":serialized:": "gAR9lC4="}))),
+        ("agents/car_1.zip", changed_model(lambda data: data[:99], "policy.pth")),
+        ("agents/car_1.vecnormalize.pkl", lambda data: data[:99]),
+        ("agents/car_1.vecnormalize.pkl", lambda _: pickle.dumps(3)),
+    ],
+)
+def test_a_damaged_file_is_refused_by_its_name(run, tmp_path, monkeypatch, capsys, name, change):
+    team = tmp_path / "team.zip"
+    rewrite(run / "team.zip", team, name, change)
+    monkeypatch.chdir(tmp_path)
+    # Also without the look at the file that trust leaves out
+    for trust in ([], ["--trust"]):
+        assert main(["export", f"{team}:car_1", *trust]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("Refused: export: ") and str(team) in said and said.count("\n") == 1
+        assert "team.json" in name or "car_1" in said
+    assert list(tmp_path.iterdir()) == [team]
