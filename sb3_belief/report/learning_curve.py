@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,8 +27,11 @@ def read_monitor(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     :raises ValueError: If another line than the last one is damaged. The message has its number
     """
     path = Path(folder) / "monitor.csv"
-    # SB3's own reader needs pandas, which is too large a dependency for one file of numbers
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"No monitor.csv in {os.fspath(folder)!r}: give the folder of a run, which has one.")
+    # SB3's own reader needs pandas, which is too large a dependency for one file of numbers. Bytes that are no text are left
+    # in the line that is then found to be damaged
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     # Even a number that can be read may be the beginning of another one
     if lines and not lines[-1].endswith("\n"):
         lines.pop()
@@ -64,7 +66,8 @@ def read_evaluations(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.nda
             returns = data["results"].mean(axis=1)
             successes = data["successes"].mean(axis=1) if "successes" in data else np.full(len(returns), np.nan)
             return data["timesteps"].astype(float), returns, successes
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    # A damaged file makes numpy and zipfile raise whatever they raise
+    except Exception as error:
         raise ValueError(f"{path}: is damaged ({error}): remove it to draw the curve without evaluations.") from error
 
 
@@ -92,17 +95,24 @@ def parts_of_run(folder: str | os.PathLike[str]) -> list[Part]:
     parts: list[Part] = []
     path: Path | None = Path(folder)
     while path is not None and path not in [part.folder for part in parts]:
-        try:
-            record = json.loads((path / "run.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            # A curve needs no record: without one, the run is taken for one that continues nothing
-            record = {}
-        start, trained = float(record.get("start_timesteps") or 0), record.get("trained_agent")
+        start, trained = _start_of(path)
         parts.insert(0, Part(path, start, parts[0].start if parts else math.inf))
         # A checkpoint lies one folder deeper than the final team
         above = list(Path(trained).parents)[:2] if start and trained else []
-        path = next((each for each in above if (each / "monitor.csv").is_file()), None)
+        # os.path, because Path.is_file raises for a name that is too long
+        path = next((each for each in above if os.path.isfile(each / "monitor.csv")), None)
     return parts
+
+
+def _start_of(folder: Path) -> tuple[float, str]:
+    """Return the joint step at which a run starts, and the team that it continues. 0 and an empty text for none."""
+    try:
+        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        start, trained = float(record["start_timesteps"]), record["trained_agent"]
+    # A curve needs no record: without one that can be read, the run is taken for one that continues nothing
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return 0.0, ""
+    return (start, trained) if isinstance(trained, str) and 0 < start < math.inf else (0.0, "")
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:

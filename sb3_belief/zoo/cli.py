@@ -14,6 +14,9 @@ _PAIRS = "key:value pairs; values are read as YAML, and a dot in a key stands fo
 # The largest numbers that make sense; beyond them numpy, torch or the system fail in ways of their own
 _MOST, _MOST_SEED, _MOST_THREADS, _MOST_FPS = 10**15, 2**31 - 1, 1024, 1000
 
+# What a shell shows of a program that ended by a closed pipe: 128 and the number of SIGPIPE
+_CLOSED_PIPE = 141
+
 
 class _Parser(argparse.ArgumentParser):
     """Parser that refuses words as the commands refuse settings."""
@@ -94,6 +97,21 @@ def _frame_rate(text: str) -> int:
     return _number(text, 1, _MOST_FPS)
 
 
+def _text(text: str) -> str:
+    # Taken for a flag that is left out, the empty value of an unset variable would train another game
+    if not text.strip():
+        raise argparse.ArgumentTypeError("must not be empty: is a variable of the shell unset?")
+    return text
+
+
+def _new_path(text: str) -> str:
+    if _text(text).startswith("~"):
+        raise argparse.ArgumentTypeError(
+            f"{text[:40]!r} begins with '~', which the shell has not replaced: write the folder out (or ./~ for that name)"
+        )
+    return text
+
+
 def _add_env_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"arguments of the environment: {_PAIRS}")
     _add_allow_package(parser)
@@ -103,6 +121,7 @@ def _add_allow_package(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--allow-package",
         **_LIST,
+        type=_text,
         metavar="NAME",
         help="further packages from which dotted paths in the configuration and module:callable may import; one that registers"
         " ids is imported for an id that is unknown without it",
@@ -118,20 +137,24 @@ def _add_trust(parser: argparse.ArgumentParser) -> None:
 def _add_common(parser: argparse.ArgumentParser) -> None:
     _add_env_options(parser)
     _add_trust(parser)
-    parser.add_argument("--device", default="auto", help="device of all models: auto, cpu, cuda, ...")
+    parser.add_argument("--device", type=_text, default="auto", help="device of all models: auto, cpu, cuda, ...")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--algo", help=f"algorithm of all agents (default: {_ALGO}, or with -i that of the saved team)")
     parser.add_argument(
-        "--env", help=f"id of the environment, see sb3-belief envs (default: {_ENV}, or with -i that of the saved team)"
+        "--algo", type=_text, help=f"algorithm of all agents (default: {_ALGO}, or with -i that of the saved team)"
+    )
+    parser.add_argument(
+        "--env",
+        type=_text,
+        help=f"id of the environment, see sb3-belief envs (default: {_ENV}, or with -i that of the saved team)",
     )
     parser.add_argument("-n", "--n-timesteps", type=_positive, help="number of joint steps, instead of the configuration's")
     parser.add_argument(
         "--seed", type=_seed, nargs="+", help="seed of the team and its environments; if left out, one is drawn and recorded"
     )
-    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
-    parser.add_argument("-tb", "--tensorboard-log", help="folder of the TensorBoard logs")
+    parser.add_argument("-f", "--log-folder", type=_new_path, default="logs", help="folder of all runs")
+    parser.add_argument("-tb", "--tensorboard-log", type=_new_path, help="folder of the TensorBoard logs")
     parser.add_argument(
         "--eval-freq", type=_positive_or_off, default=25_000, help="evaluate every N joint steps; -1 for never"
     )
@@ -144,7 +167,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         "--eval-env-kwargs", **_LIST, metavar="K:V", help="arguments of the environment in evaluations, beside --env-kwargs"
     )
     parser.add_argument("-params", **_LIST, metavar="K:V", help=f"settings: {_PAIRS}")
-    parser.add_argument("-conf", "--conf-file", help="YAML file instead of zoo_configs/<algo>.yml")
+    parser.add_argument("-conf", "--conf-file", type=_text, help="YAML file instead of zoo_configs/<algo>.yml")
     parser.add_argument(
         "--vec-env",
         choices=["dummy", "subproc"],
@@ -159,7 +182,9 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
         help="number of processes in which agents with on-policy algorithms learn; the result is the same for any number",
     )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
-    parser.add_argument("-i", "--trained-agent", help="folder of a run, or zip of a team, whose training is to be continued")
+    parser.add_argument(
+        "-i", "--trained-agent", type=_text, help="folder of a run, or zip of a team, whose training is to be continued"
+    )
     parser.add_argument(
         "--verbose",
         type=int,
@@ -171,8 +196,8 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_enjoy(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", help="folder of a run, or zip of a team")
-    parser.add_argument("--env", help="id of the environment, for the zip of a team that was saved from Python")
+    parser.add_argument("run", type=_text, help="folder of a run, or zip of a team")
+    parser.add_argument("--env", type=_text, help="id of the environment, for the zip of a team that was saved from Python")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--episodes", type=_positive, default=1, help="number of episodes to play")
     length.add_argument("-n", "--n-timesteps", type=_positive, help="number of steps to play instead")
@@ -182,7 +207,7 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
     )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
     parser.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
-    parser.add_argument("--output", help=".gif or .mp4 file to write; if left out, a window is opened")
+    parser.add_argument("--output", type=_new_path, help=".gif or .mp4 file to write; if left out, a window is opened")
     parser.add_argument(
         "--fps", type=_frame_rate, help="frames per second of the file; if left out, the environment's own rate"
     )
@@ -191,10 +216,15 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
 
 def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "agent", metavar="TEAM:agent", help="folder of a run or zip of a team, and the agent; or the zip of a single agent"
+        "agent",
+        type=_text,
+        metavar="TEAM:agent",
+        help="folder of a run or zip of a team, and the agent; or the zip of a single agent",
     )
     parser.add_argument("--format", choices=["onnx", "torch"], default="onnx", help="format of the file")
-    parser.add_argument("--output", help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder")
+    parser.add_argument(
+        "--output", type=_new_path, help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder"
+    )
     _add_allow_package(parser)
     _add_trust(parser)
 
@@ -204,9 +234,11 @@ def _add_envs(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(suite=None)
     what = parser.add_subparsers(dest="what", metavar="list | check")
     listing = what.add_parser("list", help="list the environments, and how to install those that are missing", **_STYLE)
-    listing.add_argument("suite", nargs="?", help="suite of which all ids are listed (default: the first of each suite)")
+    listing.add_argument(
+        "suite", type=_text, nargs="?", help="suite of which all ids are listed (default: the first of each suite)"
+    )
     check = what.add_parser("check", help="play an environment and report what it lacks for a team", **_STYLE)
-    check.add_argument("env", help="id of the environment, or module:callable")
+    check.add_argument("env", type=_text, help="id of the environment, or module:callable")
     check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="number of steps to play")
     check.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
     _add_env_options(check)
@@ -218,7 +250,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--episodes", type=_positive, default=DEMO_EPISODES, help="number of episodes of each measurement")
     parser.add_argument("--seed", type=_seed, default=0, help="seed of the team and its environments")
-    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+    parser.add_argument("-f", "--log-folder", type=_new_path, default="logs", help="folder of all runs")
 
 
 #: Joint steps of the demo, which take less than five minutes on two cores, and episodes of each of its measurements. With the
@@ -231,7 +263,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Run the command ``sb3-belief``.
 
     :param argv: The words after the name of the command. None for those of the process
-    :return: Exit status: 0, 1 if an environment failed its check, 2 if a setting was refused, 130 after Ctrl-C
+    :return: Exit status: 0, 1 if an environment failed its check, 2 if a setting was refused, 130 after Ctrl-C, 141 if the
+        pipe that takes the output was closed
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     args = make_parser().parse_args(argv)
@@ -258,13 +291,32 @@ def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.
         # hides an installed package
         sys.path.append(os.getcwd())
     try:
-        return action(args, command)
+        status = action(args, command)
+        # Otherwise a closed pipe would be found only when Python ends
+        sys.stdout.flush()
+        return status
     except ConfigError as error:
         print(f"Refused: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        if not _is_closed():
+            # Another pipe than the output's, such as that of a worker process
+            raise
+        return _CLOSED_PIPE
+
+
+def _is_closed() -> bool:
+    """Return whether nobody reads the output any more (``| head``). What is left of it is then thrown away."""
+    try:
+        # Only writing tells, and an empty line before a traceback does no harm
+        print(flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 # The functions below import what they need themselves: torch and Stable-Baselines3 take seconds, which --help should not

@@ -156,8 +156,8 @@ def check_eval_env(config: RunConfig, env: TeamVecEnv, eval_env: TeamVecEnv) -> 
                 differing = shorten(f"the {kind} space of {agent!r} is {own} in training and {other} in evaluations")
     if differing:
         raise ConfigError(
-            f"{config.origin('eval_env_kwargs:')}: eval_env_kwargs: {differing}, in which the team cannot act: evaluations need"
-            " the agents and spaces of the training."
+            f"{config.origin('eval_env_kwargs:')}: eval_env_kwargs: {differing}, in which the team cannot act:"
+            " evaluations need the agents and spaces of the training."
         )
 
 

@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnNoModelImprovement,
     StopTrainingOnRewardThreshold,
 )
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_value
@@ -121,7 +122,14 @@ class SettingsChecker:
         if key == "policy" and value not in self.policies:
             raise unknown_setting(location.text, "policy", value, self.policies)
         if key == "policy_kwargs" and self.policy_class is not None:
-            return check_call(self.policy_class, value, location, reserved=self.policy_reserved)
+            checked = check_call(self.policy_class, value, location, reserved=self.policy_reserved)
+            networks = checked.get("net_arch")
+            # SB3 makes no network of a name that it does not know, and says nothing
+            names = ("pi", "vf" if issubclass(self.algo_class, OnPolicyAlgorithm) else "qf")
+            for name in networks if isinstance(networks, dict) else ():
+                if name not in names:
+                    raise unknown_setting(location.key("net_arch").text, "network", name, names)
+            return checked
         if key == "normalize" and isinstance(value, dict):
             return check_call(VecNormalize, value, location, skip=1)
         if key in ("env_kwargs", "eval_env_kwargs"):

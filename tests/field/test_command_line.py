@@ -41,6 +41,12 @@ def refused(words, tmp_path, monkeypatch, capsys):
         ("n_epochs:0", "-params: n_epochs: must be at least 1, not 0"),
         ("policy_kwargs.net_arch:[8,-8]", "-params: policy_kwargs: net_arch: must be at least 1, not -8"),
         ("policy_kwargs.net_arch:{pi: [8], vf: [0]}", "net_arch: vf: must be at least 1, not 0"),
+        (
+            "policy_kwargs.net_arch:{pl: [8]}",
+            "-params: policy_kwargs: net_arch: unknown network 'pl'. Did you mean 'pi'? Allowed: pi, vf.",
+        ),
+        ("policy_kwargs.net_arch:{pi: [8], qf: [8]}", "net_arch: unknown network 'qf'."),
+        ("agent_kwargs:{car_1: {policy_kwargs: {net_arch: {v: [8]}}}}", "car_1: policy_kwargs: net_arch: unknown network 'v'"),
         ("policy_kwargs.embedding_dim:-1", "embedding_dim: must be at least 1, not -1"),
         ("ent_coef:.nan", "ent_coef: must be a finite number, not nan"),
         ("learning_rate:-.inf", "learning_rate: must be a finite number, not -inf"),
@@ -108,6 +114,7 @@ def test_settings_that_sb3_refuses_late_or_never(pair, message, tmp_path, monkey
         (["-params", "history_length:1e13"], "Lower 'history_length'"),
         (["--algo", "maskable_ppo", "--env", "convention-swap"], "maskable_ppo needs action masks, and convention-swap gives"),
         (["--algo", "dqn", "-params", "train_freq:[1, episode]"], "counts episodes, which needs n_envs: 1, not 8"),
+        (["--algo", "sac", "-params", "policy:MlpPolicy", "policy_kwargs.net_arch:{pi: [8], vf: [8]}"], "network 'vf'"),
         (["--algo", "dqn", "-params", "train_freq:[1, epoch]"], "'step' or 'episode' not 'epoch'"),
         (["--algo", "dqn", "-params", "train_freq:[1, 2]"], "train_freq: must be an integer or a list (an integer, a string)"),
         (["--algo", "dqn", "-params", "train_freq:[0, step]"], "train_freq: must be at least 1, not 0"),
@@ -117,6 +124,44 @@ def test_settings_that_sb3_refuses_late_or_never(pair, message, tmp_path, monkey
 )
 def test_flags_and_sizes_that_are_refused(words, message, tmp_path, monkeypatch, capsys):
     assert message in refused(["train", "--env", JUNCTION, *words], tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["train", flag] for flag in ("--env", "--algo", "-f", "-tb", "-i", "-conf", "--device", "--allow-package")),
+        *(["enjoy", "x", flag] for flag in ("--env", "--output", "--device")),
+        *([command] for command in ("enjoy", "export")),
+        *(["export", "x:y", "--output"], ["envs", "list"], ["envs", "check"], ["demo", "-f"]),
+    ],
+)
+def test_values_that_are_empty_are_refused(words, tmp_path, monkeypatch, capsys):
+    for empty in ("", " "):
+        assert "must not be empty" in refused([*words, empty], tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("words", [["train", "-f"], ["train", "-tb"], ["enjoy", "x", "--output"], ["demo", "-f"]])
+def test_a_home_that_the_shell_has_not_replaced_is_refused(words, tmp_path, monkeypatch, capsys):
+    for path in ("~nouser/x", "~/x.gif"):
+        assert f"'{path}' begins with '~'" in refused([*words, path], tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGPIPE")
+def test_a_closed_pipe_ends_the_command_quietly():
+    command = f"{sys.executable} -m sb3_belief envs"
+    # Nobody reads; the shell's exit status is that of the command
+    script = f"set -o pipefail; {command} | true"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_closed_pipe_of_another_program_is_no_end_of_the_output(monkeypatch):
+    def fail(*_):
+        raise BrokenPipeError("of a worker")
+
+    monkeypatch.setitem(COMMANDS, "envs", (*COMMANDS["envs"][:2], fail))
+    with pytest.raises(BrokenPipeError, match="of a worker"):
+        main(["envs"])
 
 
 def test_a_gpu_that_is_not_there_is_refused(tmp_path, monkeypatch, capsys):

@@ -127,6 +127,49 @@ def test_runs_that_continue_others_share_one_axis(tmp_path, figures):
     assert read_episodes(third)[0].tolist() == [30, 40, 50, 60, 70]
 
 
+@pytest.mark.parametrize(
+    "record",
+    [
+        *("", "{", "[1]", "3", "null", '"x"', "{}", "[" * 100_000, '{"start_timesteps": 1e999, "trained_agent": "x"}'),
+        *('{"start_timesteps": "x"}', '{"start_timesteps": [1]}', '{"start_timesteps": -5, "trained_agent": "x"}'),
+        '{"start_timesteps": NaN, "trained_agent": "x"}',
+        f'{{"start_timesteps": {10**400}, "trained_agent": "x"}}',
+        '{"start_timesteps": 5, "trained_agent": [1]}',
+    ],
+)
+def test_a_curve_needs_no_record(record, tmp_path):
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n")
+    (tmp_path / "run.json").write_text(record)
+    assert read_episodes(tmp_path)[0].tolist() == [20]
+    assert plot_learning_curve(tmp_path, tmp_path / "curve.png").exists()
+
+
+@pytest.mark.parametrize("trained", ["\x00", "a" * 300 + "/x", "nowhere/team.zip"])
+def test_a_run_whose_beginning_is_lost_keeps_its_place(trained, tmp_path):
+    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n")
+    (tmp_path / "run.json").write_text(json.dumps({"start_timesteps": 5, "trained_agent": trained}))
+    assert read_episodes(tmp_path)[0].tolist() == [25]
+
+
+def test_what_is_no_folder_of_a_run_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"No monitor\.csv in '.*nowhere': give the folder of a run"):
+        plot_learning_curve(tmp_path / "nowhere", tmp_path / "curve.png")
+    (tmp_path / "monitor.csv").write_bytes(HEADER.encode() + b"\xff,20,0.1,True\n-1.5,20,0.1,True\n")
+    with pytest.raises(ValueError, match=r"monitor\.csv, line 3: .* is not an episode"):
+        read_monitor(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"\x93NUMPY"])
+def test_damaged_evaluations_are_named(content, tmp_path):
+    (tmp_path / "evaluations.npz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
+        read_evaluations(tmp_path)
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    (tmp_path / "one.npy").replace(tmp_path / "evaluations.npz")
+    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
+        read_evaluations(tmp_path)
+
+
 def test_return_or_success_at_choice(tmp_path, figures):
     (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n-0.5,20,0.2,False\n")
     for quantity, label, values in (
