@@ -95,16 +95,17 @@ class RunConfig:
         Return where the settings come from that an error message speaks of.
 
         :param message: The message
-        :return: The flags, or file and sections, of the settings that it names; of all settings if it names none
+        :return: The flags, or file and sections, of the settings that it names, by their names or by the classes that are
+            their values. If it names none: the flags that were given, or else the file
         """
-        # Some names of settings are words of every message ("policy"): these must be quoted, or stand before a value
-        named = [
-            origin
-            for name, origin in self.origins.items()
-            if re.search(rf"\b{re.escape(name)}\b" + ("" if "_" in name else r"(['`\"=:]| is\b)"), message)
-        ]
-        flags = [origin for origin in self.origins.values() if origin.startswith("-")]
-        return ", ".join(dict.fromkeys(named or [self.source, *flags]))
+        for agent, own in self.settings.get("agent_kwargs", {}).items():
+            if repr(agent) in message and any(_speaks_of(message, *setting) for setting in _with_nested(own)):
+                return f"{self.origins['agent_kwargs']}: agent_kwargs: {agent}"
+        settings = _with_nested(self.settings)
+        named = [self.origins[name] for name, value in settings if name in self.origins and _speaks_of(message, name, value)]
+        # What is new is more likely to fail than a file that has worked; the number of steps is no setting of what is made
+        flags = [text for text in self.origins.values() if text.startswith("-") and text != "--n-timesteps"]
+        return ", ".join(dict.fromkeys(named or flags or [self.source]))
 
     def agent(self, name: str) -> AgentConfig:
         """
@@ -221,7 +222,8 @@ def find_config_file(algo: str, conf_file: str | None = None) -> Path:
     """
     if conf_file is not None:
         if not os.path.isfile(conf_file):
-            raise ConfigError(f"--conf-file: no file {conf_file!r}.")
+            what = f"{conf_file!r} is a folder: name a file in it" if os.path.isdir(conf_file) else f"no file {conf_file!r}"
+            raise ConfigError(f"--conf-file: {what}.")
         return Path(conf_file)
     candidates = [REPO_CONFIGS / f"{algo}.yml"]
     # Outside a checkout the files are data files of the distribution. They are installed beside the package, at a path with
@@ -238,6 +240,21 @@ def find_config_file(algo: str, conf_file: str | None = None) -> Path:
             # Relative where possible, because every error message contains the path
             return candidate.relative_to(Path.cwd()) if candidate.is_relative_to(Path.cwd()) else candidate
     raise ConfigError(f"No {algo}.yml in {REPO_CONFIGS} nor beside the installed package: name a file with --conf-file.")
+
+
+def _with_nested(settings: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Return settings, and those in the mappings among them, with their values."""
+    nested = [pair for value in settings.values() if isinstance(value, dict) for pair in value.items()]
+    return [*settings.items(), *nested]
+
+
+def _speaks_of(message: str, name: str, value: Any) -> bool:
+    # Some names of settings are words of every message ("policy"): these must be quoted, or stand before a value
+    if re.search(rf"\b{re.escape(name)}\b" + ("" if "_" in name else r"(['`\"=:]| is\b)"), message):
+        return True
+    # A class that fails names itself, and not the setting that named it
+    module, _, last = value.rpartition(".") if isinstance(value, str) else ("", "", "")
+    return bool(module) and re.search(rf"\b{re.escape(last)}\b", message) is not None
 
 
 def _last(layers: Sequence[tuple[Location, dict[str, Any]]], key: str) -> tuple[str, Any]:

@@ -17,7 +17,7 @@ from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.evaluate import Outcome
 from sb3_belief.zoo.names import get_env, load_env
 from sb3_belief.zoo.preflight import check_device, check_output
-from sb3_belief.zoo.run_folder import CONFIG, RECORD, find_team, run_of
+from sb3_belief.zoo.run_folder import CONFIG, RECORD, check_record, find_team, run_of
 from sb3_belief.zoo.trust import check_saved_team
 from sb3_belief.zoo.yaml_data import parse_pairs
 
@@ -147,6 +147,7 @@ def _environment_of(team: Path, options: EnjoyOptions) -> _Shown:
             " name it with --env, and its arguments with --env-kwargs."
         )
     algo, env_id, conf_file = run
+    check_record(run, packages)
     config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=packages)
     return _Shown(config.env_id, config.env_kwargs, config.wrapper)
 

@@ -106,6 +106,6 @@ def unknown_setting(where: str, kind: str, given: object, allowed: Iterable[str]
     :return: The error to raise
     """
     names = list(allowed)
-    return ConfigError(
-        f"{where}: unknown {kind} {short(given)}.{suggestion(given, names)} Allowed: {', '.join(names) or 'none'}."
-    )
+    name, colon, value = str(given).partition(":")
+    hint = f" A space belongs after the colon: {name}: {value}." if colon and name in names else suggestion(given, names)
+    return ConfigError(f"{where}: unknown {kind} {short(given)}.{hint} Allowed: {', '.join(names) or 'none'}.")

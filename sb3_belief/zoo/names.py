@@ -27,6 +27,15 @@ ALLOWED_PACKAGES = (
     "torch.nn",
     "torch.optim",
 )
+# Where the classes and wrappers are that other libraries' configurations name without their modules
+_WELL_KNOWN = (
+    "torch.nn",
+    "torch.optim",
+    "supersuit",
+    "stable_baselines3.common.callbacks",
+    "stable_baselines3.common.buffers",
+    "stable_baselines3.common.torch_layers",
+)
 
 
 @dataclass(frozen=True)
@@ -115,7 +124,9 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     packages = (*ALLOWED_PACKAGES, *extra_packages)
     module_name, _, name = path.rpartition(".") if isinstance(path, str) else ("", "", "")
     if not module_name or not all(part.isidentifier() for part in path.split(".")):
-        raise ConfigError(f"{where}: {short(path)} is not a dotted path such as 'supersuit.frame_stack_v1'.")
+        found_in = _modules_of(path) if isinstance(path, str) and path.isidentifier() else []
+        example = f": write {' or '.join(found_in)}" if found_in else " such as 'supersuit.frame_stack_v1'"
+        raise ConfigError(f"{where}: {short(path)} is not a dotted path{example}.")
     allowed = f"Allowed: what {', '.join(packages)} define (more packages: the flag --allow-package NAME)."
     if not is_allowed(module_name, packages):
         root = path.split(".")[0]
@@ -132,9 +143,28 @@ def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Call
     except (AttributeError, ImportError) as error:
         public = [attr for attr in dir(module) if not attr.startswith("_")]
         raise ConfigError(f"{where}: {module_name!r} has no {name!r} ({error}).{suggestion(name, public)} {allowed}") from None
+    if type(found).__module__ == "supersuit.utils.wrapper_chooser":
+        # It is not a wrapper but chooses one for the kind of environment, which here is always the same
+        found = found.parallel_wrapper
+        if found is None:
+            raise ConfigError(
+                f"{where}: {path!r} takes a function, which YAML cannot hold: write a function f(env) of your own that returns"
+                f" {path}(env, ...), name it instead as <module>.f, and allow its module with --allow-package."
+            )
     is_code = inspect.isclass(found) or inspect.isfunction(found)
     if not is_code or not is_allowed(found.__module__, packages):
         raise ConfigError(f"{where}: {path!r} is not a class or function that its package defines itself. {allowed}")
+    return found
+
+
+def _modules_of(name: str) -> list[str]:
+    """Return the dotted paths of what has a name, in any case, in the modules whose names are often written alone."""
+    found = []
+    for module_name in _WELL_KNOWN:
+        module = importlib.import_module(module_name)
+        found += [
+            f"{module_name}.{each}" for each in dir(module) if each.lower() == name.lower() and callable(vars(module)[each])
+        ]
     return found
 
 

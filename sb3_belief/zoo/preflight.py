@@ -13,10 +13,12 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import get_device
 
+from sb3_belief.envs.random_play import sample_action
 from sb3_belief.team import TeamVecEnv
 from sb3_belief.zoo.config import AgentConfig, RunConfig
-from sb3_belief.zoo.errors import ConfigError, reason_of, short, shorten
+from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short, shorten
 
 _GB = 1e9
 # Least memory of a copy of an environment, in bytes: the objects of one in this process, and a Python with numpy in a worker
@@ -136,6 +138,64 @@ def check_memory(config: RunConfig, env: TeamVecEnv) -> None:
             f"{config.origin(name)}: the models need about {needed / _GB:,.0f} GB of memory, and this machine has"
             f" {total_memory() / _GB:,.0f} GB. Lower {name!r}, of which {agent} alone needs {largest[name] / _GB:,.1f} GB."
         )
+
+
+def check_optimizers(config: RunConfig, device: str) -> None:
+    """
+    Check that the optimisers that a configuration names make a step as Stable-Baselines3 calls them.
+
+    :param config: Configuration of the team
+    :param device: ``"auto"`` or the name of a device
+    :raises ConfigError: If one cannot be made, or fails in its first step
+    """
+    common = (config.origin("optimizer_class optimizer_kwargs"), config.algo_kwargs)
+    own = [
+        (f"{config.origins['agent_kwargs']}: agent_kwargs: {name}", each.algo_kwargs) for name, each in config.agents.items()
+    ]
+    for where, kwargs in (common, *own):
+        settings = kwargs.get("policy_kwargs") or {}
+        if settings.keys() & {"optimizer_class", "optimizer_kwargs"}:
+            try:
+                _step_optimizer(settings.get("optimizer_class", th.optim.Adam), settings.get("optimizer_kwargs") or {}, device)
+            # torch raises whatever the optimiser raises
+            except Exception as error:
+                raise ConfigError(
+                    f"{where}: policy_kwargs: the optimizer refuses what Stable-Baselines3 does with one: {cause(error)} Use"
+                    " another optimizer_class, such as torch.optim.Adam, or other optimizer_kwargs."
+                ) from error
+
+
+def _step_optimizer(optimizer_class: type[th.optim.Optimizer], kwargs: dict[str, Any], device: str) -> None:
+    """Make a step with gradients of zero, as for a network of one layer: dense gradients, and no closure."""
+    parameters = [th.nn.Parameter(th.zeros(shape, device=get_device(device))) for shape in ((2, 2), (2,))]
+    optimizer: Any = optimizer_class(parameters, lr=1e-3, **kwargs)  # type: ignore[call-arg]
+    for parameter in parameters:
+        parameter.grad = th.zeros_like(parameter)
+    optimizer.step()
+
+
+def check_step(config: RunConfig, env: TeamVecEnv) -> None:
+    """
+    Check that an environment with wrappers of the configuration can be stepped.
+
+    :param config: Configuration of the team
+    :param env: A copy for this alone: a step might change what a reset does not
+    :raises ConfigError: If a step with random actions fails
+    """
+    try:
+        env.reset()
+        masks, rng = env.action_masks() or {}, np.random.default_rng(0)
+        acted = cast("spaces.Dict", env.action_space)
+        env.step(
+            {
+                agent: np.stack([sample_action(acted[agent], masks[agent][0] if agent in masks else None, rng)])
+                for agent in env.possible_agents
+            }
+        )
+    except Exception as error:
+        raise ConfigError(
+            f"{config.origin('env_wrapper')}: env_wrapper: {config.env_id} cannot be stepped with it: {cause(error)}"
+        ) from error
 
 
 def check_eval_env(config: RunConfig, env: TeamVecEnv, eval_env: TeamVecEnv) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError, suggestion
-from sb3_belief.zoo.run_folder import find_team, run_of
+from sb3_belief.zoo.run_folder import check_record, find_team, run_of
 from sb3_belief.zoo.settings import RUN_KEYS
 from sb3_belief.zoo.yaml_data import parse_pairs
 
@@ -48,6 +48,7 @@ def resume_config(
     run = run_of(find_team(trained, "--trained-agent"))
     if run is not None:
         saved_algo, saved_env, saved_conf = run
+        check_record(run, further.get("extra_packages", ()), of_env=env_id is None)
         algo, env_id = algo or saved_algo, env_id or saved_env
         if algo != saved_algo:
             raise ConfigError(f"--algo: {algo!r} does not fit the saved team, which is of {saved_algo!r}.")

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.common.versions import versions
 from sb3_belief.envs.suites import SUITES, comma_separated
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short
+from sb3_belief.zoo.names import get_algo, load_env
 
 CONFIG = "config.yml"
 RECORD = "run.json"
@@ -208,3 +209,19 @@ def run_of(team: Path) -> tuple[str, str, Path] | None:
                 raise ConfigError(f"{folder / RECORD}: does not say which 'algo' and 'env' the run had: it is damaged.")
             return record["algo"], record["env"], folder / CONFIG
     return None
+
+
+def check_record(run: tuple[str, str, Path], extra_packages: tuple[str, ...] = (), of_env: bool = True) -> None:
+    """
+    Check the algorithm and the environment that a run's record names, so that no flag is blamed for them.
+
+    :param run: What ``run_of`` returns
+    :param extra_packages: See ``names.resolve``
+    :param of_env: Whether to check the environment too
+    :raises ConfigError: If there is no such algorithm, or no such environment. The message names the record
+    """
+    algo, env_id, conf_file = run
+    record = conf_file.with_name(RECORD)
+    get_algo(algo, f"{record}: algo")
+    if of_env:
+        load_env(env_id, f"{record}: env", extra_packages)

@@ -98,6 +98,8 @@ class SettingsChecker:
             elif key in self.arguments:
                 checked[key] = check_value(value, self.arguments[key], location.key(key))
                 check_limits({key: checked[key]}, location.text)
+            elif self.policy_class is not None and key in accepted_arguments(self.policy_class)[0]:
+                raise ConfigError(f"{location.text}: {key!r} is a setting of the policy: write policy_kwargs: {{{key}: ...}}.")
             else:
                 raise unknown_setting(location.text, "key", key, allowed)
         return checked
@@ -166,6 +168,11 @@ class SettingsChecker:
 def _check_callback(callback: Any, location: Location) -> None:
     if not (isinstance(callback, type) and issubclass(callback, BaseCallback)):
         raise ConfigError(f"{location.text}: {callback.__name__} is not a callback of Stable-Baselines3.")
+    if "eval_env" in accepted_arguments(callback)[0]:
+        raise ConfigError(
+            f"{location.text}: {callback.__name__} needs an environment, which YAML cannot hold: the team is evaluated every"
+            " --eval-freq joint steps (--eval-episodes, --n-eval-envs and --eval-env-kwargs say how)."
+        )
     if issubclass(callback, StopTrainingOnRewardThreshold | StopTrainingOnNoModelImprovement):
         raise ConfigError(
             f"{location.text}: {callback.__name__} works only inside an EvalCallback, to which YAML cannot pass it: train from"

@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from inspect import signature
@@ -18,7 +18,15 @@ from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause
-from sb3_belief.zoo.preflight import check_copies, check_device, check_eval_env, check_folder, check_memory
+from sb3_belief.zoo.preflight import (
+    check_copies,
+    check_device,
+    check_eval_env,
+    check_folder,
+    check_memory,
+    check_optimizers,
+    check_step,
+)
 from sb3_belief.zoo.run_folder import (
     CHECKPOINTS,
     CONFIG,
@@ -117,6 +125,9 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         config.check_agents(env.possible_agents)
         check_memory(config, env)
         _check_first_reset(config, env)
+        if config.wrapper is not None:
+            with closing(make_env(config, 1, seed)) as tried:
+                check_step(config, tried)
         eval_env = None
         if options.eval_freq > 0:
             eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
@@ -178,6 +189,10 @@ def _check_options(config: RunConfig, options: TrainOptions) -> None:
         if find_spec("tensorboard") is None:
             raise ConfigError("-tb: TensorBoard's logs need tensorboard: pip install 'sb3-belief[plots]'.")
         check_folder(Path(options.tensorboard_log, config.algo, folder_name(config.env_id)), "-tb")
+    for _, kwargs in config.callbacks:
+        if isinstance(kwargs.get("save_path"), str):
+            check_folder(kwargs["save_path"], f"{config.origin('callback:')}: callback: save_path")
+    check_optimizers(config, options.device)
     check_copies(config.n_envs, options.vec_env, config.origin("n_envs"))
     if options.eval_freq > 0:
         check_copies(options.n_eval_envs, "dummy", "--n-eval-envs")
