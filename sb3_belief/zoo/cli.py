@@ -8,12 +8,19 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.flag_types import (
+    filled_text,
+    frame_rate,
+    new_path,
+    positive_number,
+    positive_or_off,
+    process_number,
+    seed_number,
+    thread_number,
+)
 
 _ALGO, _ENV = "belief_ppo", "traffic-junction-medium"
 _PAIRS = "key:value pairs; values are read as YAML, and a dot in a key stands for a nested one"
-# The largest numbers that make sense; beyond them numpy, torch or the system fail in ways of their own
-_MOST, _MOST_SEED, _MOST_THREADS, _MOST_FPS = 10**15, 2**31 - 1, 1024, 1000
-
 # What a shell shows of a program that ended by a closed pipe: 128 and the number of SIGPIPE
 _CLOSED_PIPE = 141
 
@@ -61,57 +68,6 @@ _STYLE: dict = {"formatter_class": _HelpFormatter, "allow_abbrev": False}
 _LIST: dict = {"nargs": "+", "action": "extend", "default": []}
 
 
-def _number(text: str, least: int, most: int) -> int:
-    try:
-        # 1e6 is a whole number too
-        value = int(text) if text.lstrip("+-").isdecimal() else float(text)
-        if value % 1 == 0 and least <= value <= most:
-            return int(value)
-    # float("nan") % 1 is no number, and Python reads no integer of thousands of digits
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {most:,}, not {text[:40]!r}")
-
-
-def _positive(text: str) -> int:
-    return _number(text, 1, _MOST)
-
-
-def _positive_or_off(text: str) -> int:
-    return -1 if text == "-1" else _positive(text)
-
-
-def _seed(text: str) -> int:
-    return _number(text, 0, _MOST_SEED)
-
-
-def _threads(text: str) -> int:
-    return -1 if text == "-1" else _number(text, 1, _MOST_THREADS)
-
-
-def _processes(text: str) -> int:
-    return _number(text, 1, _MOST_THREADS)
-
-
-def _frame_rate(text: str) -> int:
-    return _number(text, 1, _MOST_FPS)
-
-
-def _text(text: str) -> str:
-    # Taken for a flag that is left out, the empty value of an unset variable would train another game
-    if not text.strip():
-        raise argparse.ArgumentTypeError("must not be empty: is a variable of the shell unset?")
-    return text
-
-
-def _new_path(text: str) -> str:
-    if _text(text).startswith("~"):
-        raise argparse.ArgumentTypeError(
-            f"{text[:40]!r} begins with '~', which the shell has not replaced: write the folder out (or ./~ for that name)"
-        )
-    return text
-
-
 def _add_env_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", **_LIST, metavar="K:V", help=f"arguments of the environment: {_PAIRS}")
     _add_allow_package(parser)
@@ -121,7 +77,7 @@ def _add_allow_package(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--allow-package",
         **_LIST,
-        type=_text,
+        type=filled_text,
         metavar="NAME",
         help="further packages from which dotted paths in the configuration and module:callable may import; one that registers"
         " ids is imported for an id that is unknown without it",
@@ -137,53 +93,60 @@ def _add_trust(parser: argparse.ArgumentParser) -> None:
 def _add_common(parser: argparse.ArgumentParser) -> None:
     _add_env_options(parser)
     _add_trust(parser)
-    parser.add_argument("--device", type=_text, default="auto", help="device of all models: auto, cpu, cuda, ...")
+    parser.add_argument("--device", type=filled_text, default="auto", help="device of all models: auto, cpu, cuda, ...")
 
 
 def _add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--algo", type=_text, help=f"algorithm of all agents (default: {_ALGO}, or with -i that of the saved team)"
+        "--algo", type=filled_text, help=f"algorithm of all agents (default: {_ALGO}, or with -i that of the saved team)"
     )
     parser.add_argument(
         "--env",
-        type=_text,
+        type=filled_text,
         help=f"id of the environment, see sb3-belief envs (default: {_ENV}, or with -i that of the saved team)",
     )
-    parser.add_argument("-n", "--n-timesteps", type=_positive, help="number of joint steps, instead of the configuration's")
     parser.add_argument(
-        "--seed", type=_seed, nargs="+", help="seed of the team and its environments; if left out, one is drawn and recorded"
+        "-n", "--n-timesteps", type=positive_number, help="number of joint steps, instead of the configuration's"
     )
-    parser.add_argument("-f", "--log-folder", type=_new_path, default="logs", help="folder of all runs")
-    parser.add_argument("-tb", "--tensorboard-log", type=_new_path, help="folder of the TensorBoard logs")
     parser.add_argument(
-        "--eval-freq", type=_positive_or_off, default=25_000, help="evaluate every N joint steps; -1 for never"
+        "--seed",
+        type=seed_number,
+        nargs="+",
+        help="seed of the team and its environments; if left out, one is drawn and recorded",
     )
-    parser.add_argument("--eval-episodes", type=_positive, default=100, help="number of episodes of an evaluation")
-    parser.add_argument("--n-eval-envs", type=_positive, default=50, help="number of environment copies of an evaluation")
+    parser.add_argument("-f", "--log-folder", type=new_path, default="logs", help="folder of all runs")
+    parser.add_argument("-tb", "--tensorboard-log", type=new_path, help="folder of the TensorBoard logs")
+    parser.add_argument("--eval-freq", type=positive_or_off, default=25_000, help="evaluate every N joint steps; -1 for never")
+    parser.add_argument("--eval-episodes", type=positive_number, default=100, help="number of episodes of an evaluation")
     parser.add_argument(
-        "--save-freq", type=_positive_or_off, default=-1, help="save every N joint steps; -1 for only at the end"
+        "--n-eval-envs", type=positive_number, default=50, help="number of environment copies of an evaluation"
+    )
+    parser.add_argument(
+        "--save-freq", type=positive_or_off, default=-1, help="save every N joint steps; -1 for only at the end"
     )
     parser.add_argument(
         "--eval-env-kwargs", **_LIST, metavar="K:V", help="arguments of the environment in evaluations, beside --env-kwargs"
     )
     parser.add_argument("-params", **_LIST, metavar="K:V", help=f"settings: {_PAIRS}")
-    parser.add_argument("-conf", "--conf-file", type=_text, help="YAML file instead of zoo_configs/<algo>.yml")
+    parser.add_argument("-conf", "--conf-file", type=filled_text, help="YAML file instead of zoo_configs/<algo>.yml")
     parser.add_argument(
         "--vec-env",
         choices=["dummy", "subproc"],
         default="dummy",
         help="whether environment copies run in this process, or in a worker process each",
     )
-    parser.add_argument("--num-threads", type=_threads, default=1, help="number of torch's threads; -1 for torch's default")
+    parser.add_argument(
+        "--num-threads", type=thread_number, default=1, help="number of torch's threads; -1 for torch's default"
+    )
     parser.add_argument(
         "--jobs",
-        type=_processes,
+        type=process_number,
         default=1,
         help="number of processes in which agents with on-policy algorithms learn; the result is the same for any number",
     )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
     parser.add_argument(
-        "-i", "--trained-agent", type=_text, help="folder of a run, or zip of a team, whose training is to be continued"
+        "-i", "--trained-agent", type=filled_text, help="folder of a run, or zip of a team, whose training is to be continued"
     )
     parser.add_argument(
         "--verbose",
@@ -196,20 +159,22 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_enjoy(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=_text, help="folder of a run, or zip of a team")
-    parser.add_argument("--env", type=_text, help="id of the environment, for the zip of a team that was saved from Python")
+    parser.add_argument("run", type=filled_text, help="folder of a run, or zip of a team")
+    parser.add_argument(
+        "--env", type=filled_text, help="id of the environment, for the zip of a team that was saved from Python"
+    )
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--episodes", type=_positive, default=1, help="number of episodes to play")
-    length.add_argument("-n", "--n-timesteps", type=_positive, help="number of steps to play instead")
+    length.add_argument("--episodes", type=positive_number, default=1, help="number of episodes to play")
+    length.add_argument("-n", "--n-timesteps", type=positive_number, help="number of steps to play instead")
     manner = parser.add_mutually_exclusive_group()
     manner.add_argument(
         "--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily (default)"
     )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
-    parser.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
-    parser.add_argument("--output", type=_new_path, help=".gif or .mp4 file to write; if left out, a window is opened")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment")
+    parser.add_argument("--output", type=new_path, help=".gif or .mp4 file to write; if left out, a window is opened")
     parser.add_argument(
-        "--fps", type=_frame_rate, help="frames per second of the file; if left out, the environment's own rate"
+        "--fps", type=frame_rate, help="frames per second of the file; if left out, the environment's own rate"
     )
     _add_common(parser)
 
@@ -217,13 +182,13 @@ def _add_enjoy(parser: argparse.ArgumentParser) -> None:
 def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "agent",
-        type=_text,
+        type=filled_text,
         metavar="TEAM:agent",
         help="folder of a run or zip of a team, and the agent; or the zip of a single agent",
     )
     parser.add_argument("--format", choices=["onnx", "torch"], default="onnx", help="format of the file")
     parser.add_argument(
-        "--output", type=_new_path, help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder"
+        "--output", type=new_path, help="file to write, .onnx or .pt2; if left out, the agent's name in the current folder"
     )
     _add_allow_package(parser)
     _add_trust(parser)
@@ -235,22 +200,24 @@ def _add_envs(parser: argparse.ArgumentParser) -> None:
     what = parser.add_subparsers(dest="what", metavar="list | check")
     listing = what.add_parser("list", help="list the environments, and how to install those that are missing", **_STYLE)
     listing.add_argument(
-        "suite", type=_text, nargs="?", help="suite of which all ids are listed (default: the first of each suite)"
+        "suite", type=filled_text, nargs="?", help="suite of which all ids are listed (default: the first of each suite)"
     )
     check = what.add_parser("check", help="play an environment and report what it lacks for a team", **_STYLE)
-    check.add_argument("env", type=_text, help="id of the environment, or module:callable")
-    check.add_argument("-n", "--n-timesteps", type=_positive, default=500, help="number of steps to play")
-    check.add_argument("--seed", type=_seed, default=0, help="seed of the environment")
+    check.add_argument("env", type=filled_text, help="id of the environment, or module:callable")
+    check.add_argument("-n", "--n-timesteps", type=positive_number, default=500, help="number of steps to play")
+    check.add_argument("--seed", type=seed_number, default=0, help="seed of the environment")
     _add_env_options(check)
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "-n", "--n-timesteps", type=_positive, default=DEMO_TIMESTEPS, help="number of joint steps to train for"
+        "-n", "--n-timesteps", type=positive_number, default=DEMO_TIMESTEPS, help="number of joint steps to train for"
     )
-    parser.add_argument("--episodes", type=_positive, default=DEMO_EPISODES, help="number of episodes of each measurement")
-    parser.add_argument("--seed", type=_seed, default=0, help="seed of the team and its environments")
-    parser.add_argument("-f", "--log-folder", type=_new_path, default="logs", help="folder of all runs")
+    parser.add_argument(
+        "--episodes", type=positive_number, default=DEMO_EPISODES, help="number of episodes of each measurement"
+    )
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the team and its environments")
+    parser.add_argument("-f", "--log-folder", type=new_path, default="logs", help="folder of all runs")
 
 
 #: Joint steps of the demo, which take less than five minutes on two cores, and episodes of each of its measurements. With the

@@ -67,7 +67,7 @@ def refused(words, tmp_path, monkeypatch, capsys):
         ("n_steps:1:30", "'1:30' is in base 60 in YAML 1.1"),
         ("n_steps:" + "9" * 400, "n_steps"),
         ("callback:stable_baselines3.common.callbacks.CheckpointCallback", "needs 'save_freq' (an integer) and 'save_path'"),
-        ("callback:stable_baselines3.common.callbacks.EvalCallback", "cannot be written in YAML"),
+        ("callback:stable_baselines3.common.callbacks.EvalCallback", "the team is evaluated every --eval-freq joint steps"),
         (
             "callback:{stable_baselines3.common.callbacks.CheckpointCallback: {save_freq: 0, save_path: x}}",
             "save_freq: must be",
