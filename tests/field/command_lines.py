@@ -162,3 +162,17 @@ def check(argv: list[str], before: Path | None = None) -> int:
         return status
     finally:
         shutil.rmtree(home)
+
+
+def refused(words, tmp_path, monkeypatch, capsys):
+    """What is said about a refused command; nothing may be written."""
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    try:
+        status = main(words)
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    said = capsys.readouterr()
+    assert status == 2 and said.err.startswith("Refused: "), said
+    assert sorted(tmp_path.rglob("*")) == before
+    return said.err

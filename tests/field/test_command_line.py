@@ -15,24 +15,10 @@ from sb3_belief.zoo import preflight
 from sb3_belief.zoo.cli import COMMANDS, main, train_main
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError, cause, shorten
-from tests.field.command_lines import SMALL, TINY
+from tests.field.command_lines import SMALL, TINY, refused
 
 JUNCTION = "traffic-junction-easy"
 _RUN = "import sys; from sb3_belief.zoo.cli import main; sys.exit(main({words}))"
-
-
-def refused(words, tmp_path, monkeypatch, capsys):
-    """What is said about a refused command; nothing may be written."""
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    try:
-        status = main(words)
-    except SystemExit as stop:
-        status = int(stop.code or 0)
-    said = capsys.readouterr()
-    assert status == 2 and said.err.startswith("Refused: "), said
-    assert sorted(tmp_path.rglob("*")) == before
-    return said.err
 
 
 @pytest.mark.parametrize(
