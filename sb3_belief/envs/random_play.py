@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 
 from sb3_belief.vec_env.action_masks import first_actions, flat_mask, mask_parts, mask_width, sample_action
 from sb3_belief.vec_env.observation_forms import as_bytes
-from sb3_belief.vec_env.returned import plain_infos, plain_reset, plain_step
+from sb3_belief.vec_env.returned import ALL, plain_ends, plain_infos, plain_reset, plain_step
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.user_env import UserEnv, separate_agents
 
@@ -162,7 +162,7 @@ class RandomPlayer:
         self.masks: dict[str, np.ndarray] = {}
         # Whose present mask allows no action, and where it was given
         self.unable: dict[str, str] = {}
-        self.t = 0
+        self.t, self.says_success = 0, False
 
     def reset(self, seed: int | None) -> bool:
         """
@@ -171,7 +171,7 @@ class RandomPlayer:
         :param seed: Seed of the reset
         :return: Whether the environment can be stepped
         """
-        record, self.t = self.record, 0
+        record, self.t, self.says_success = self.record, 0, False
         try:
             obs, infos = plain_reset(self.env.reset(seed=seed), "at reset")
             infos = plain_infos(infos, self.agents, "at reset")
@@ -203,8 +203,11 @@ class RandomPlayer:
             obs, rewards, terminations, truncations, infos = plain_step(self.env.step(actions), f"at step {self.t}")
             infos = plain_infos(infos, self.agents, f"at step {self.t}")
             after = list(self.env.agents)
-            if not self._check_agents("agents", after):
+            ended = [name for name in (*terminations, *truncations) if name != ALL]
+            if not self._check_agents("agents", after) or not self._check_agents("terminations and truncations", ended):
                 return False
+            if ALL in terminations or ALL in truncations:
+                terminations, truncations = plain_ends(terminations, truncations, self.agents, before, f"at step {self.t}")
             self._check_observations(obs, before)
             self._check_rewards(rewards, before)
             self._check_ends(terminations, truncations, before, after)
@@ -224,9 +227,10 @@ class RandomPlayer:
         # repr(), because a faulty value may be of any type, and nan would differ from itself
         numbers = [repr(rewards.get(agent)) for agent in before]
         record.trace.append((before, after, numbers, flags, visible, scripted, *self._as_bytes(obs, infos)))
+        self.says_success |= any("is_success" in infos.get(agent, {}) for agent in before if agent not in after)
         if not after:
             record.lengths.append(self.t)
-            record.successes.append(any("is_success" in infos.get(agent, {}) for agent in before))
+            record.successes.append(self.says_success)
             record.endings.append("truncated" if any(truncated for _, truncated in flags) else "terminated")
         return True
 

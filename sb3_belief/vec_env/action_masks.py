@@ -1,5 +1,6 @@
 """Action masks as sb3-contrib's ``MaskablePPO`` takes them: one row of flags, those of all dimensions side by side."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,43 @@ def flat_mask(mask: Any) -> np.ndarray:
     """
     Return a mask as one row.
 
-    :param mask: Flags as an array or a list, or those of each dimension in a tuple or list of arrays of different lengths
+    :param mask: Flags as an array or a list, or those of each dimension in a tuple, list or dict of arrays
     :return: The same flags side by side
     """
+    if isinstance(mask, Mapping):
+        mask = list(mask.values())
     if isinstance(mask, (tuple, list)):
         mask = np.concatenate([np.ravel(part) for part in mask])
     return np.asarray(mask).ravel()
+
+
+def mask_row(mask: Any, space: spaces.Space, agent: str, where: str | None = None) -> np.ndarray:
+    """
+    Return the flags of a mask as one row.
+
+    :param mask: The mask as ``flat_mask`` takes it
+    :param space: The agent's action space
+    :param agent: Name of the agent
+    :param where: Copy and step, in words; None to take the mask as it is, since to check each one takes time
+    :return: The flags, bool
+    :raises ValueError: If it is checked and holds anything but flags, or parts that are not those of the dimensions
+    """
+    row = flat_mask(mask)
+    flags = row if row.dtype == bool else row.astype(bool) if row.dtype.kind in "iuf" else None
+    if where is not None and (flags is None or (flags != row).any()):
+        raise ValueError(
+            f"The action mask of {agent!r} {where} holds {row.tolist()[:8]}: a mask consists of flags, True or 1 for each"
+            " action that is possible, False or 0 for the others."
+        )
+    parts = list(mask.values()) if isinstance(mask, Mapping) else mask
+    if where is not None and isinstance(parts, (tuple, list)) and any(np.ndim(part) for part in parts):
+        sizes = [np.size(part) for part in parts]
+        if sizes != mask_parts(space):
+            raise ValueError(
+                f"The action mask of {agent!r} {where} has parts of {sizes} flags, but {space} has dimensions of"
+                f" {mask_parts(space)}: give a part for each dimension, in their order."
+            )
+    return row.astype(bool) if flags is None else flags
 
 
 def first_actions(space: spaces.Space) -> np.ndarray:

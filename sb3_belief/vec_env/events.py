@@ -5,6 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_belief.vec_env.returned import ALL, plain_ends, plain_flag
+from sb3_belief.vec_env.validation import place
+
+# What an agent's info says by flags
+_SAID = frozenset(("active", "next_active", "life_end", "is_success"))
+_BOOLS = frozenset((bool, np.bool_))
+
 
 class Flags(NamedTuple):
     """
@@ -27,13 +34,13 @@ class Events(NamedTuple):
     :param flags: What the step meant for each agent
     :param ended: Whether all agents that acted have terminated or been truncated, and no other is in play now
     :param left: Agents that left in this step
-    :param successes: The ``is_success`` of the agents that reported one
+    :param successes: The ``is_success`` of each agent that reported one
     """
 
     flags: Flags
     ended: bool
     left: list[str]
-    successes: list[bool]
+    successes: dict[str, bool]
 
 
 def no_flags(n_agents: int) -> Flags:
@@ -52,6 +59,8 @@ def find_events(
     terminations: Mapping[str, bool],
     truncations: Mapping[str, bool],
     infos: Mapping[str, Any],
+    copy: int,
+    step: int,
 ) -> Events:
     """
     Find out what happened to the agents.
@@ -62,17 +71,31 @@ def find_events(
     :param terminations: As the environment returned them
     :param truncations: As the environment returned them
     :param infos: The agents' infos, each a dict or something empty
+    :param copy: Number of the environment copy, for error messages
+    :param step: Number of the step, for error messages
     :return: What happened
+    :raises ValueError: If something is no flag, or terminates or truncates an unknown agent
     """
-    left, successes = [], []
+    over = False
+    names = set(agents)
+    if not all(ends.keys() <= names and _BOOLS.issuperset(map(type, ends.values())) for ends in (terminations, truncations)):
+        said_of_all = terminations.get(ALL, False), truncations.get(ALL, False)
+        terminations, truncations = plain_ends(terminations, truncations, agents, before, place(copy, step))
+        over = any(map(np.any, said_of_all))
+    left, successes = [], {}
     active, life_end, truncated = flags = no_flags(len(agents))
     ended = True
     for i, agent in enumerate(agents):
         if agent not in before:
             # The others of a relay have only just entered
-            ended = ended and agent not in after
+            ended = ended and (over or agent not in after)
             continue
         agent_info = infos.get(agent) or {}
+        for key in agent_info.keys() & _SAID:
+            # An environment may have the entry and not know yet
+            if type(agent_info[key]) not in _BOOLS and not (key == "is_success" and agent_info[key] is None):
+                said = plain_flag(f"infos have {key!r} =", agent_info[key], agent, place(copy, step))
+                agent_info = {**agent_info, key: said}
         terminates, truncates = terminations.get(agent, False), truncations.get(agent, False)
         has_left = agent not in after
         # An agent that leaves for no stated reason has ended its life: there is nothing to bootstrap from
@@ -87,5 +110,5 @@ def find_events(
         if not (terminates or truncates):
             ended = False
         if agent_info.get("is_success") is not None:
-            successes.append(bool(agent_info["is_success"]))
+            successes[agent] = bool(agent_info["is_success"])
     return Events(flags, ended, left, successes)

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
-from sb3_belief.vec_env.action_masks import flat_mask, mask_width
+from sb3_belief.vec_env.action_masks import mask_row, mask_width
 from sb3_belief.vec_env.events import Events, Flags, find_events, no_flags
 from sb3_belief.vec_env.observation_forms import ObservationForms, copied, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
@@ -32,8 +32,8 @@ from sb3_belief.vec_env.visible import VisibleOthers
 
 # Says whose action of the last step each agent could observe: bool [n_others] by agent
 Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
-# Types of the sum of rewards, if these are numbers
-_NUMBERS = {float, int, np.float64, np.float32, np.int64, np.int32}
+# Types of infos, and of the sum of rewards if these are numbers
+_DICT, _NUMBERS = {dict}, {float, int, np.float64, np.float32, np.int64, np.int32}
 
 
 class StepRecord(NamedTuple):
@@ -116,6 +116,8 @@ class JointEnv(gym.Env):
         self._zero_obs = {agent: zeros_in(space) for agent, space in self.observation_spaces.items()}
         # Set at the first info that holds an action mask
         self._has_masks = False
+        # What those who left before the end of the episode said of its success
+        self._said_success: dict[str, bool] = {}
         # Names and shapes in a form that each step's check can compare with quickly
         self._names = dict.fromkeys(self.possible_agents).keys()
         self._shapes = [(agent, space.shape) for agent, space in self.observation_spaces.items() if space.shape]
@@ -135,7 +137,7 @@ class JointEnv(gym.Env):
         :return: Observations by agent, and an info with ``action_masks`` as in ``StepRecord``, empty without masks
         :raises ValueError: If what the environment returns does not fit its agents and spaces
         """
-        self._t = 0
+        self._t, self._said_success = 0, {}
         try:
             result = self._game.reset(seed=seed, options=options)
         except Exception as error:
@@ -143,7 +145,7 @@ class JointEnv(gym.Env):
             raise
         obs, infos = plain_reset(result, self._where)
         if self._forms is not None:
-            obs, infos = self._forms.convert(obs, infos)
+            obs, infos = self._forms.convert(obs, infos, self._where)
         separate_agents(self.env)
         after = self._agents_told()
         if not after:
@@ -178,7 +180,7 @@ class JointEnv(gym.Env):
             after = list(self._game.agents)
             obs, rewards, terminations, truncations, infos = result
             any_info = any(infos.values())
-            any_end = True in terminations.values() or True in truncations.values()
+            any_end = any(terminations.values()) or any(truncations.values())
             agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
             total = sum(agent_rewards)
             as_usual = obs.keys() == self._names and rewards.keys() == self._names and after == agents
@@ -202,13 +204,10 @@ class JointEnv(gym.Env):
         team_reward = float(total / len(agents)) if self._team_reward is None else self._own_team_reward(rewards, total)
         # In nearly all steps of nearly all environments nothing happens to any agent, and the loop over agents is saved
         if any_info or any_end or len(after) < len(agents):
-            try:
-                info = own_infos(infos, self.action_spaces) if any_info else {}
-            except AttributeError:
-                # The info of an agent is no dict
+            if any_info and not _DICT.issuperset(map(type, infos.values())):
                 infos = plain_infos(infos, agents, self._where)
-                info = own_infos(infos, self.action_spaces)
-            events = find_events(agents, before, after, terminations, truncations, infos)
+            events = find_events(agents, before, after, terminations, truncations, infos, self._copy, self._t)
+            info = own_infos(infos, self.action_spaces) if any_info else {}
             info["joint"] = self._record(agent_rewards, events.flags, infos if any_info or self._has_masks else None)
             return self._after_events(obs, team_reward, events, not after, info)
         record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
@@ -224,12 +223,13 @@ class JointEnv(gym.Env):
             self._check_ends(obs, flags, self.possible_agents if done else left)
         observations = self._observations(obs)
         if done:
-            if events.successes:
-                info["is_success"] = all(events.successes)
+            if successes := self._said_success | events.successes:
+                info["is_success"] = all(successes.values())
         elif left:
             # Copies of the last observations, before zeros replace them
             info["terminal_observation"] = {agent: copied(observations[agent]) for agent in left}
             observations.update({agent: self._zero_obs[agent] for agent in left})
+            self._said_success |= {agent: said for agent, said in events.successes.items() if agent in left}
         cut = done and bool(flags.truncated.any())
         return observations, team_reward, done and not cut, cut, info
 
@@ -237,7 +237,7 @@ class JointEnv(gym.Env):
         """Return what a step returned with observations in the form that models take, and masks in the infos."""
         assert self._forms is not None
         obs, rewards, terminations, truncations, infos = plain_step(result, self._where)
-        obs, infos = self._forms.convert(obs, infos)
+        obs, infos = self._forms.convert(obs, infos, self._where if self._t < 2 else None)
         return obs, rewards, terminations, truncations, infos
 
     def _agents_told(self) -> list[str]:
@@ -344,16 +344,21 @@ class JointEnv(gym.Env):
         if not self._has_masks:
             return {}
         masks = []
+        # What is wrong with masks is mostly wrong from the beginning
+        where = self._where if self._t < 2 else None
         for agent in self.possible_agents:
             width = self._mask_widths[agent]
             info = infos.get(agent) or {}
-            mask = flat_mask(info["action_mask"]).astype(bool) if "action_mask" in info else np.ones(width, dtype=bool)
-            if width and mask.size != width:
+            if "action_mask" not in info or not width:
+                masks.append(np.ones(width, dtype=bool))
+                continue
+            mask = mask_row(info["action_mask"], self.action_spaces[agent], agent, where)
+            if mask.size != width:
                 raise ValueError(
                     f"The action mask of {agent!r} {self._where} must have {width} entries, one for each"
                     f" action, got {mask.size}."
                 )
-            masks.append(mask[:width])
+            masks.append(mask)
         return {"action_masks": np.concatenate(masks)}
 
 

@@ -54,6 +54,9 @@ def own_infos(infos: Mapping[str, Any], agents: Mapping[str, Any]) -> dict[str, 
                 key: value if type(value) in _CONSTANTS else _kept(value) for key, value in info.items() if key not in RESERVED
             }
             if own:
+                if "next_active" in own:
+                    # Known to be one flag, perhaps as an array
+                    own["next_active"] = bool(np.any(own["next_active"]))
                 by_agent[name] = own
                 for key, value in own.items():
                     if key in _NOT_OF_THE_TEAM:
@@ -76,4 +79,8 @@ def _kept(value: Any) -> Any:
     """Return a value that does not change when the environment goes on; SB3's vectorisers copy infos for the same reason."""
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value.copy()
-    return deepcopy(value)
+    try:
+        return deepcopy(value)
+    except Exception:
+        # Locks, generators, open files: what cannot be copied is passed on as it is
+        return value

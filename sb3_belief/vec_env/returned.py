@@ -13,6 +13,8 @@ import numpy as np
 from sb3_belief.vec_env.validation import check_names, not_finite
 
 StepParts = tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]
+# Under this name RLlib's environments say that all who acted have terminated or been truncated
+ALL = "__all__"
 _PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 
 
@@ -108,14 +110,52 @@ def plain_flags(name: str, flags: Mapping[str, Any], agents: Iterable[str], wher
     :param where: Copy and step, in words
     :raises ValueError: If an agent is unknown, or something cannot be read as a flag
     """
-    check_names(list(agents), (), (), {name: flags}, where)
-    plain = {}
-    for agent, flag in flags.items():
-        array = np.asarray(flag)
-        if array.size != 1 or array.dtype.kind not in "biuf":
-            raise ValueError(f"The {name} have {flag!r} for {agent!r} {where}: return True or False for each agent.")
-        plain[agent] = bool(array.item())
-    return plain
+    check_names([*agents, ALL], (), (), {name: flags}, where)
+    return {agent: plain_flag(f"{name} have", flag, agent, where) for agent, flag in flags.items()}
+
+
+def plain_flag(what: str, given: Any, agent: str, where: str) -> bool:
+    """
+    Return a flag as a bool.
+
+    :param what: What has it, with a verb
+    :param given: True or False, 1 or 0, or an array or list of one of these
+    :param agent: Whom it concerns
+    :param where: Copy and step, in words
+    :raises ValueError: If it is something else
+    """
+    try:
+        array = np.asarray(given)
+    except ValueError:
+        # Lists of different lengths
+        array = np.zeros(0)
+    if array.size != 1 or array.dtype.kind not in "biuf" or array.item() not in (0, 1):
+        raise ValueError(f"The {what} {given!r} for {agent!r} {where}: return True or False for each agent.")
+    return bool(array.item())
+
+
+def plain_ends(
+    terminations: Mapping[str, Any], truncations: Mapping[str, Any], agents: Iterable[str], before: Iterable[str], where: str
+) -> tuple[dict[str, bool], dict[str, bool]]:
+    """
+    Return who has terminated and who was truncated, also where an environment says it of all at once.
+
+    :param terminations: Flags by agent. As in RLlib, True under ``"__all__"`` holds for all who acted, but not for those who
+        are truncated by an entry of their own
+    :param truncations: The same
+    :param agents: ``possible_agents``
+    :param before: The agents that acted
+    :param where: Copy and step, in words
+    :return: Both, by agent alone
+    :raises ValueError: If an agent is unknown, or something cannot be read as a flag
+    """
+    terminated = plain_flags("terminations", terminations, agents, where)
+    truncated = plain_flags("truncations", truncations, agents, where)
+    if terminated.pop(ALL, False):
+        terminated |= {agent: not truncated.get(agent, False) or terminated.get(agent, False) for agent in before}
+    if truncated.pop(ALL, False):
+        truncated |= {agent: not terminated.get(agent, False) or truncated.get(agent, False) for agent in before}
+    return terminated, truncated
 
 
 def plain_infos(infos: Mapping[str, Any], agents: Iterable[str], where: str) -> dict[str, dict[str, Any]]:

@@ -62,8 +62,11 @@ class UserEnv(ParallelEnv):
                 self._obs_shapes[agent] = observations.shape
             if self.action_spaces[agent] is not actions:
                 self._action_shapes[agent] = actions.shape
+        #: The environment's own names of its agents
+        self.own_names = names
+        # The text of a member of a class (str, Enum) is another than the string that it is
         #: Whether the names are not those of the environment
-        self.renames = any(not isinstance(name, str) for name in names)
+        self.renames = any(type(name) is not str for name in names)
         #: Whether anything differs from the environment itself, so that it has to be stepped through this object
         self.adapts = bool(
             self.renames or self._obs_shapes or self._action_shapes or not (self._takes_seed and self._takes_options)

@@ -181,6 +181,15 @@ def _check_part(agent: str, what: str, value: Any, space: spaces.Space, where: s
     choices = n_choices(space)
     if choices is not None and not ((array >= 0) & (array < choices)).all():
         raise not_a_choice(what, array, agent, space, where)
+    if np.issubdtype(space.dtype, np.integer) and array.dtype != space.dtype:
+        with np.errstate(invalid="ignore"):
+            changed = array.astype(space.dtype) != array
+        if changed.any():
+            raise ValueError(
+                f"The {what} {where} holds {array[changed].flat[0]}, but its observation space is {space}, in whose type it is"
+                f" another number: return what lies in it, e.g. a picture of shares as (255 * picture).astype(np.uint8), or"
+                f" correct observation_space({agent!r})."
+            )
 
 
 def n_choices(space: spaces.Space) -> Any:
