@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import aec_to_parallel, turn_based_aec_to_parallel_wrapper
-from pettingzoo.utils.wrappers import BaseParallelWrapper
+from pettingzoo.utils.conversions import aec_to_parallel, aec_to_parallel_wrapper, turn_based_aec_to_parallel_wrapper
+from pettingzoo.utils.wrappers import BaseParallelWrapper, BaseWrapper
 
 from sb3_belief.envs.suites import unknown_name
 from sb3_belief.vec_env.action_masks import first_actions
 from sb3_belief.vec_env.observation_forms import ObservationForms
+from sb3_belief.vec_env.user_env import UserEnv
 
 _GROUPS = ("atari", "butterfly", "classic", "sisl")
 
@@ -90,7 +91,7 @@ def to_parallel(env: AECEnv | ParallelEnv, turn_based: bool | None = None) -> Pa
       ``{"observation": ..., "action_mask": ...}``, are moved to the infos, whatever the other entries are called. Tuples and
       nested dicts become dicts of one level (``"sensors/camera"``).
 
-    :param env: The environment, AEC or parallel
+    :param env: The environment, AEC or parallel; also an object with the whole interface of a ``ParallelEnv``
     :param turn_based: Whether an AEC environment is turn-based; None to go by its metadata
     :return: The parallel environment
     :raises TypeError: If it is neither
@@ -100,11 +101,15 @@ def to_parallel(env: AECEnv | ParallelEnv, turn_based: bool | None = None) -> Pa
         if turn_based is None:
             turn_based = not env.metadata.get("is_parallelizable", False)
         return TurnBased(env) if turn_based else AllAtOnce(env)
+    kind = type(env).__name__
     if not isinstance(env, ParallelEnv):
-        raise TypeError(f"to_parallel() needs an AECEnv or a ParallelEnv of PettingZoo, got {type(env).__name__}.")
+        try:
+            env = UserEnv(env)
+        except TypeError as error:
+            raise TypeError(f"to_parallel() needs an AECEnv or a ParallelEnv of PettingZoo, got {kind}: {error}") from None
     if turn_based is not None:
         raise ValueError(
-            f"turn_based={turn_based} says how to convert an AECEnv, but {type(env).__name__} is a ParallelEnv: leave it out."
+            f"turn_based={turn_based} says how to convert an AECEnv, but {kind} is a ParallelEnv: leave it out."
             " An environment of this kind says by infos[agent]['active'] = False who could not act in a step."
         )
     return in_model_form(env)
@@ -154,6 +159,26 @@ class Adapter(BaseParallelWrapper):
         return getattr(self.env, name) if hasattr(self.env, name) else getattr(self.env.unwrapped, name)
 
 
+class _WithInfos(BaseWrapper):
+    """AEC environment in which each agent has an info, without which PettingZoo's conversions and its dead step fail."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed=seed, options=options)
+        self._fill()
+
+    def step(self, action: Any) -> None:
+        super().step(action)
+        self._fill()
+
+    def _fill(self) -> None:
+        game = self.env
+        while isinstance(game, BaseWrapper):
+            game = game.env
+        infos = getattr(game, "infos", None) or {}
+        if not all(isinstance(infos.get(agent), dict) for agent in game.agents):
+            game.infos = {**infos, **{agent: infos.get(agent) or {} for agent in game.agents}}
+
+
 class AllAtOnce(Adapter):
     """
     AEC environment whose agents all act at once, on what they observed at the beginning of the cycle.
@@ -165,7 +190,10 @@ class AllAtOnce(Adapter):
         if not env.metadata.get("is_parallelizable", False):
             # to_parallel(env, turn_based=False) overrides what PettingZoo's conversion looks at
             env.metadata = {**env.metadata, "is_parallelizable": True}
-        super().__init__(in_model_form(aec_to_parallel(env)))
+        parallel = aec_to_parallel(env)
+        if isinstance(parallel, aec_to_parallel_wrapper):
+            parallel.aec_env = _WithInfos(env)
+        super().__init__(in_model_form(parallel))
         self._aec = env
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
@@ -211,10 +239,20 @@ class AllAtOnce(Adapter):
 
 
 class _Turns(turn_based_aec_to_parallel_wrapper):
-    """PettingZoo's conversion, with what the others observe once those who are out have left."""
+    """PettingZoo's conversion, in which those who are out leave at once, and with what the others observe from then on."""
+
+    def __init__(self, env: AECEnv):
+        super().__init__(_WithInfos(env))
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        acted = set(self.agents)
         obs, rewards, terminations, truncations, infos = super().step(actions)
+        # A game may let those who are out wait for their turn before it takes them out of its agents
+        out = {agent for agent, ended in terminations.items() if ended or truncations.get(agent)}
+        for part in (obs, terminations, truncations, infos):
+            for agent in out - acted:
+                part.pop(agent, None)
+        self.agents = [agent for agent in self.agents if agent not in out]
         if len(self.agents) < len(obs):
             # Until then one who is out was on turn, and nobody else had an action in its mask
             obs.update({agent: self.aec_env.observe(agent) for agent in self.agents})
@@ -315,7 +353,7 @@ class ModelObservations(Adapter):
         :param options: Passed on to the environment
         :return: Observations and infos, by agent
         """
-        return self._forms.convert(*self.env.reset(seed=seed, options=options))
+        return self._forms.convert(*self.env.reset(seed=seed, options=options), "at reset")
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
@@ -325,7 +363,7 @@ class ModelObservations(Adapter):
         :return: Observations, rewards, terminations, truncations and infos, by agent
         """
         obs, rewards, terminations, truncations, infos = self.env.step(actions)
-        obs, infos = self._forms.convert(obs, infos)
+        obs, infos = self._forms.convert(obs, infos, "at a step")
         return obs, rewards, terminations, truncations, infos
 
 
