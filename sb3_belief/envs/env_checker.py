@@ -110,6 +110,7 @@ def check_team_env(
             record = play_randomly(played, n_steps, seed)
             for topic, text in record.faults.items():
                 report.add(topic, "FAIL", text)
+            _report_like_masks(first, record, report)
             _report_pettingzoo(make, bool(record.masked), report)
             # With the fault "play" the environment could not be stepped, so there is nothing to compare or describe
             if "play" not in record.faults:
@@ -225,6 +226,16 @@ def _report_play(record: PlayRecord, report: Report) -> None:
     if "ends" not in faults:
         report.add("ends", *record.ends_summary())
         report.add("success", *record.success_summary())
+
+
+def _report_like_masks(env: UserEnv, record: PlayRecord, report: Report) -> None:
+    """Note what may be meant as a mask and is an input like others."""
+    for agent, names in ObservationForms(env).like_masks.items():
+        if names and agent not in record.masked:
+            change = "if it is one, call it 'action_mask' in a Dict, or give it as infos[agent]['action_mask']"
+            text = f"{names[0]!r} of the observation of {agent!r} looks like a mask of its actions, and is an ordinary input"
+            report.add("masks", "note", f"{text}; {change}")
+            return
 
 
 def _report_state(env: UserEnv, seed: int, report: Report) -> None:

@@ -132,13 +132,21 @@ def with_flag(key, value):
 
 
 @pytest.mark.parametrize("key", KEYS)
-@pytest.mark.parametrize("value", [None, "False", "", np.zeros(2, bool), np.ones(2), [[1], [1, 2]], 0.5, np.nan, {}, []])
+@pytest.mark.parametrize("value", ["False", "", np.zeros(2, bool), np.ones(2), [[1], [1, 2]], 0.5, np.nan, {}, []])
 def test_what_is_no_flag(key, value):
-    if key == "is_success" and value is None:
-        pytest.skip("an environment may not know yet")
     with pytest.raises(ValueError) as error:
         play(make_team_env(with_flag(key, value)), 3)
     assert str(error.value).startswith(f"The infos have {key!r} = {value!r} for 'walker_1' {WHERE}: return True or False")
+
+
+@pytest.mark.parametrize("key", KEYS[:3])
+def test_none_is_no_flag_either(key):
+    with pytest.raises(ValueError, match=f"The infos have '{key}' = None for 'walker_1' {WHERE}"):
+        play(make_team_env(with_flag(key, None)), 3)
+
+
+def test_none_where_the_success_is_not_known_yet():
+    assert "is_success" not in play(make_team_env(with_flag("is_success", None)), 4)[3][3][0]
 
 
 @pytest.mark.parametrize("key", KEYS)
