@@ -9,7 +9,7 @@ from sb3_belief.vec_env.returned import ALL, plain_ends, plain_flag
 from sb3_belief.vec_env.validation import place
 
 # What an agent's info says by flags
-_SAID = frozenset(("active", "next_active", "life_end", "is_success"))
+_SAID = ("active", "next_active", "life_end", "is_success")
 _BOOLS = frozenset((bool, np.bool_))
 
 
@@ -52,6 +52,11 @@ def no_flags(n_agents: int) -> Flags:
     return Flags(np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool), np.zeros(n_agents, dtype=bool))
 
 
+def _are_plain(ends: Mapping[str, Any], agents: Sequence[str]) -> bool:
+    """Return whether the ends are flags of known agents."""
+    return ends.keys() <= set(agents) and _BOOLS.issuperset(map(type, ends.values()))
+
+
 def find_events(
     agents: Sequence[str],
     before: Sequence[str],
@@ -77,8 +82,8 @@ def find_events(
     :raises ValueError: If something is no flag, or terminates or truncates an unknown agent
     """
     over = False
-    names = set(agents)
-    if not all(ends.keys() <= names and _BOOLS.issuperset(map(type, ends.values())) for ends in (terminations, truncations)):
+    any_end = any(terminations.values()) or any(truncations.values())
+    if any_end and not (_are_plain(terminations, agents) and _are_plain(truncations, agents)):
         said_of_all = terminations.get(ALL, False), truncations.get(ALL, False)
         terminations, truncations = plain_ends(terminations, truncations, agents, before, place(copy, step))
         over = any(map(np.any, said_of_all))
@@ -91,11 +96,12 @@ def find_events(
             ended = ended and (over or agent not in after)
             continue
         agent_info = infos.get(agent) or {}
-        for key in agent_info.keys() & _SAID:
-            # An environment may have the entry and not know yet
-            if type(agent_info[key]) not in _BOOLS and not (key == "is_success" and agent_info[key] is None):
-                said = plain_flag(f"infos have {key!r} =", agent_info[key], agent, place(copy, step))
-                agent_info = {**agent_info, key: said}
+        if agent_info:
+            for key in _SAID:
+                # An environment may have the entry and not know yet
+                if type(agent_info.get(key, False)) not in _BOOLS and not (key == "is_success" and agent_info[key] is None):
+                    said = plain_flag(f"infos have {key!r} =", agent_info[key], agent, place(copy, step))
+                    agent_info = {**agent_info, key: said}
         terminates, truncates = terminations.get(agent, False), truncations.get(agent, False)
         has_left = agent not in after
         # An agent that leaves for no stated reason has ended its life: there is nothing to bootstrap from

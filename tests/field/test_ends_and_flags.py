@@ -36,11 +36,7 @@ class AllAtOnceWithLists(AllAtOnce):
 @pytest.mark.parametrize("part", [2, 3])
 @pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
 def test_all_have_ended(kind, part, vec_env):
-    class Ends(kind):
-        pass
-
-    Ends.part = part
-    env = make_team_env(Ends, vec_env=vec_env)
+    env = make_team_env(type("Ends", (kind,), {"part": part}), vec_env=vec_env)
     for t, (_, _, dones, infos) in enumerate(play(env, 4), start=1):
         over = t % 2 == 0
         assert dones.tolist() == [over]
@@ -87,7 +83,8 @@ def test_the_checker_reads_what_is_said_of_all():
 class Leaves(Walkers):
     """``walker_0`` leaves at step 2 with its verdict; the other plays to the end, with its own."""
 
-    early, late = True, True
+    early = True
+    late: bool | None = True
 
     def change(self, *parts):
         if self.t == 2:

@@ -15,7 +15,7 @@ from sb3_belief.envs import check_team_env, to_parallel
 from tests.field.walkers import Walkers, play
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 
-BOX = spaces.Box(-1e6, 1e6, (3,), np.float32)
+BOX: Any = spaces.Box(-1e6, 1e6, (3,), np.float32)
 FLAGS = spaces.MultiBinary(3)
 KWARGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "n_epochs": 1, "device": "cpu"}
 
@@ -169,7 +169,7 @@ class Deep(Walkers):
         return self.build(super().observe(agent), np.array([0, 1, 1], np.int8))
 
 
-MASKED = spaces.Dict({"seen": BOX, "action_mask": FLAGS})
+MASKED: Any = spaces.Dict({"seen": BOX, "action_mask": FLAGS})
 DEEP: dict[str, tuple[spaces.Space, Any, spaces.Space]] = {
     "beside": (
         spaces.Dict({"own": MASKED, "goal": BOX}),

@@ -241,6 +241,8 @@ class AllAtOnce(Adapter):
 class _Turns(turn_based_aec_to_parallel_wrapper):
     """PettingZoo's conversion, in which those who are out leave at once, and with what the others observe from then on."""
 
+    agents: list[Any]
+
     def __init__(self, env: AECEnv):
         super().__init__(_WithInfos(env))
 
@@ -353,7 +355,8 @@ class ModelObservations(Adapter):
         :param options: Passed on to the environment
         :return: Observations and infos, by agent
         """
-        return self._forms.convert(*self.env.reset(seed=seed, options=options), "at reset")
+        obs, infos = self.env.reset(seed=seed, options=options)
+        return self._forms.convert(obs, infos, "at reset")
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
