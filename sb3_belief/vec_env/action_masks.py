@@ -68,7 +68,8 @@ def mask_row(mask: Any, space: spaces.Space, agent: str, where: str | None = Non
     parts = list(mask.values()) if isinstance(mask, Mapping) else mask
     if where is not None and isinstance(parts, (tuple, list)) and any(np.ndim(part) for part in parts):
         sizes = [np.size(part) for part in parts]
-        if sizes != mask_parts(space):
+        # A single row, or that of a single dimension, may be split in any way
+        if len(sizes) > 1 and len(mask_parts(space)) > 1 and sizes != mask_parts(space):
             raise ValueError(
                 f"The action mask of {agent!r} {where} has parts of {sizes} flags, but {space} has dimensions of"
                 f" {mask_parts(space)}: give a part for each dimension, in their order."

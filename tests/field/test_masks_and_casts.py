@@ -110,6 +110,16 @@ def test_a_mask_for_each_dimension():
             make_team_env(partial(Two, parts)).reset()
 
 
+def test_masks_that_are_split_otherwise():
+    class Board(Masked):
+        act_space = spaces.Discrete(4)
+
+    for make, row in ((partial(Board, [[1, 0], [0, 1]]), [1, 0, 0, 1]), (partial(Two, [[1, 0, 1, 1, 0]]), [1, 0, 1, 1, 0])):
+        env = make_team_env(make)
+        env.reset()
+        assert env.action_masks()["walker_0"].tolist() == [[bool(flag) for flag in row]]
+
+
 class Asked(Walkers):
     """Gives a mask to whom it is asked about."""
 
