@@ -67,6 +67,9 @@ class _Reader(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what a pickle names, if it may."""
+        if (module, name) == ("builtins", "getattr"):
+            # How Python 3.11.0 to 3.11.3 name the member of an Enum, such as SB3's unit of train_freq
+            return _member
         if is_allowed(module, self._packages):
             return super().find_class(module, name)
         if (module, name) not in _NAMES:
@@ -77,6 +80,13 @@ class _Reader(pickle.Unpickler):
                 raise _Untrusted(f"{module}.{name}")
             return found
         return super().find_class(module, name)
+
+
+def _member(enum_class: Any, name: str) -> enum.Enum:
+    """Return a member of an Enum, for which alone a pickle may use ``getattr``."""
+    if not (inspect.isclass(enum_class) and issubclass(enum_class, enum.Enum) and name in enum_class.__members__):
+        raise _Untrusted("builtins.getattr")
+    return enum_class[name]
 
 
 def check_saved_team(path: Path, where: str, extra_packages: tuple[str, ...] = (), or_single_agent: bool = False) -> None:

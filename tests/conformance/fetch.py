@@ -41,7 +41,10 @@ def fetch(suite: str) -> Path:
             raise RuntimeError(f"pip could not fetch the source distribution of {requirement}; its own message stands above")
         (archive,) = Path(scratch).glob("*.tar.gz")
         with tarfile.open(archive) as unpacked:
-            unpacked.extractall(scratch, filter="data")
+            # Pythons before 3.10.12 and 3.11.4 have no filters
+            if hasattr(tarfile, "data_filter"):
+                unpacked.extraction_filter = tarfile.data_filter
+            unpacked.extractall(scratch)
         source = archive.with_name(archive.name.removesuffix(".tar.gz"))
         if not (source / "tests").is_dir():
             raise RuntimeError(f"the source distribution of {requirement} holds no folder 'tests'")

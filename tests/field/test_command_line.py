@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from sb3_belief.common.versions import __version__
+from sb3_belief.envs import registry
 from sb3_belief.team import Team
 from sb3_belief.zoo import preflight
 from sb3_belief.zoo.cli import COMMANDS, main, train_main
@@ -316,6 +317,8 @@ def test_registered_ids_and_open_constructors(tmp_path, monkeypatch, capsys):
     (tmp_path / "walking_games.py").write_text(GAMES.format(name="walking-games"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
+    # What is registered here is forgotten afterwards
+    monkeypatch.setattr(registry, "_SPECS", dict(registry._SPECS))
     words = [
         "train",
         "--env",

@@ -12,8 +12,12 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.zoo.cli import main
+from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.trust import check_saved_team
 from tests.field.command_lines import CODE, ENV, MADE, SMALL, TINY, check, draws
 
 
@@ -134,6 +138,29 @@ def test_what_is_not_damaged_is_played_and_continued(name, runs):
     env, algo = (["--env", ENV], ["--algo", "belief_ppo"]) if name == "moved.zip" else ([], [])
     assert check(["enjoy", name, "-n", "3", *env], runs) == 0
     assert check(["train", "-i", name, "-n", "4", "--eval-freq", "-1", "--verbose", "0", *env, *algo], runs) == 0
+
+
+class MemberByName:
+    """An Enum's member as some Pythons pickle it, and another attribute in the same way."""
+
+    def __init__(self, owner, name):
+        self.owner, self.name = owner, name
+
+    def __reduce__(self):
+        return getattr, (self.owner, self.name)
+
+
+def test_members_of_an_enum_are_data_and_other_attributes_are_not(runs, tmp_path):
+    def with_member(owner, name):
+        pickled = pickle.dumps(MemberByName(owner, name))
+        shutil.copy(runs / "run" / "team.zip", tmp_path / "team.zip")
+        _rewrite(tmp_path / "team.zip", "agents/follower.vecnormalize.pkl", lambda _: pickled)
+        check_saved_team(tmp_path / "team.zip", "enjoy")
+
+    with_member(TrainFrequencyUnit, "STEP")
+    for owner, name in ((TrainFrequencyUnit, "mro"), (VecNormalize, "load"), (VecNormalize, "__init__")):
+        with pytest.raises(ConfigError, match=r"needs 'builtins\.getattr', which could run any code"):
+            with_member(owner, name)
 
 
 @pytest.mark.parametrize("name", ["pickle", "data"])
