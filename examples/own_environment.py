@@ -21,12 +21,15 @@ class Meeting(ParallelEnv):
 
     def __init__(self) -> None:
         self.possible_agents, self.rng = ["left", "right"], np.random.default_rng()
+        # The same object at each call, as PettingZoo asks for
+        self._sees: dict[str, spaces.Space] = {agent: spaces.MultiDiscrete([5, 5]) for agent in self.possible_agents}
+        self._moves: dict[str, spaces.Space] = {agent: spaces.Discrete(3) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> spaces.Space:
-        return spaces.MultiDiscrete([5, 5])  # the cells of both agents
+        return self._sees[agent]  # the cells of both agents
 
     def action_space(self, agent: str) -> spaces.Space:
-        return spaces.Discrete(3)  # one cell to the left, stay, one cell to the right
+        return self._moves[agent]  # one cell to the left, stay, one cell to the right
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
         if seed is not None:  # without a seed the generator continues

@@ -22,6 +22,8 @@ from sb3_belief.zoo.flag_types import (
 _ALGO, _ENV = "belief_ppo", "traffic-junction-medium"
 _PAIRS = "key:value pairs; values are read as YAML, and a dot in a key stands for a nested one"
 # What a shell shows of a program that ended by a closed pipe: 128 and the number of SIGPIPE
+# What an install for serving lacks (docs/deploy.md)
+_OF_THE_WHOLE_PACKAGE = {"greenlet", "pettingzoo", "sb3_contrib", "supersuit"}
 _CLOSED_PIPE = 141
 
 
@@ -264,6 +266,15 @@ def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.
         return status
     except ConfigError as error:
         print(f"Refused: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in _OF_THE_WHOLE_PACKAGE:
+            raise
+        why = (
+            f"this command needs {missing}, which an install for serving leaves out: install sb3-belief with all that it needs"
+        )
+        print(f"Refused: {why}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
