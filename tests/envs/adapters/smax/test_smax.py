@@ -112,7 +112,7 @@ def test_state_resumes_exactly(mixed):
         for draw in draws:
             obs, rewards, dones, infos = env.step(dict(zip(env.possible_agents, draw, strict=True)))
             untimed = [{**info, "episode": info.get("episode", {}).get("r")} for info in infos]
-            rows.append((obs, rewards, dones, untimed, env.action_masks()))
+            rows.append((dict(obs), rewards, dones, untimed, env.action_masks()))
         return pickle.dumps(rows)
 
     mixed.seed(5)
