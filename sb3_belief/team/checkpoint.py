@@ -12,6 +12,7 @@ import pickle
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -145,6 +146,19 @@ def write_team(
         raise
 
 
+def agent_file(agent: str, names: Collection[str]) -> str:
+    """
+    Return the name of an agent's file in a team's file.
+
+    :param agent: Name of the agent
+    :param names: What the team's file holds
+    :return: The name without its ending, ``.zip`` for the model and ``.vecnormalize.pkl`` for the statistics
+    """
+    quoted = f"agents/{file_name(agent)}"
+    # Earlier versions wrote all names as they are
+    return quoted if f"{quoted}.zip" in names else f"agents/{agent}"
+
+
 def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
     """
     Read a team's file.
@@ -167,9 +181,7 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
             manifest = json.loads(archive.read("team.json"))
             if manifest.get("format") != FORMAT:
                 raise ValueError(f"{path} has the team format {manifest.get('format')!r}; this version reads {FORMAT}.")
-            # Earlier versions wrote all names as they are
-            files = {agent: f"agents/{file_name(agent)}" for agent in manifest["agents"]}
-            files |= {agent: f"agents/{agent}" for agent, file in files.items() if f"{file}.zip" not in names}
+            files = {agent: agent_file(agent, names) for agent in manifest["agents"]}
             models = {agent: archive.read(f"{file}.zip") for agent, file in files.items()}
             statistics = {
                 agent: pickle.loads(archive.read(f"{file}.vecnormalize.pkl"))

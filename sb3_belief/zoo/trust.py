@@ -24,6 +24,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_belief.team.checkpoint import agent_file
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.names import ALLOWED_PACKAGES, is_allowed
 
@@ -111,10 +112,10 @@ def check_saved_team(path: Path, where: str, extra_packages: tuple[str, ...] = (
                 module = str(class_name).partition(":")[0]
                 if not is_allowed(module, (*ALLOWED_PACKAGES, *extra_packages)):
                     raise _Untrusted(str(class_name))
-                _check_model(team.read(f"agents/{agent}.zip"), extra_packages)
-                statistics = f"agents/{agent}.vecnormalize.pkl"
-                if statistics in team.namelist():
-                    _Reader(team.read(statistics), extra_packages).load()
+                file = agent_file(agent, team.namelist())
+                _check_model(team.read(f"{file}.zip"), extra_packages)
+                if f"{file}.vecnormalize.pkl" in team.namelist():
+                    _Reader(team.read(f"{file}.vecnormalize.pkl"), extra_packages).load()
     except _Untrusted as error:
         raise ConfigError(
             f"{where}: {str(path)!r} is not loaded, because agent {agent!r} needs {str(error)[:100]!r}, which could run any"

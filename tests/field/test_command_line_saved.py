@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from stable_baselines3 import PPO
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -19,6 +20,8 @@ from sb3_belief.zoo.cli import main
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.trust import check_saved_team
 from tests.field.command_lines import CODE, ENV, MADE, SMALL, TINY, check, draws
+from tests.field.walkers import Walkers
+from tests.team.helpers import Team, make_team_env
 
 
 class _Evil:
@@ -138,6 +141,20 @@ def test_what_is_not_damaged_is_played_and_continued(name, runs):
     env, algo = (["--env", ENV], ["--algo", "belief_ppo"]) if name == "moved.zip" else ([], [])
     assert check(["enjoy", name, "-n", "3", *env], runs) == 0
     assert check(["train", "-i", name, "-n", "4", "--eval-freq", "-1", "--verbose", "0", *env, *algo], runs) == 0
+
+
+def test_agents_whose_names_are_quoted_in_the_file_are_found(tmp_path):
+    class Walk(Walkers):
+        def __init__(self):
+            super().__init__()
+            self.possible_agents = ["left/first", "right"]
+
+    team = Team(PPO, "MlpPolicy", make_team_env(Walk), normalize=True, n_steps=8, batch_size=8, device="cpu").learn(8)
+    team.save(tmp_path / "team.zip")
+    check_saved_team(tmp_path / "team.zip", "enjoy")
+    _rewrite(tmp_path / "team.zip", "agents/left%2Ffirst.vecnormalize.pkl", lambda _: pickle.dumps(_Evil()))
+    with pytest.raises(ConfigError, match=r"agent 'left/first' needs 'posix\.mkdir'"):
+        check_saved_team(tmp_path / "team.zip", "enjoy")
 
 
 class MemberByName:
