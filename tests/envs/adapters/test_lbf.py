@@ -11,7 +11,14 @@ from pettingzoo.test import parallel_api_test
 
 from sb3_belief import make_team_env
 from sb3_belief.envs.adapters import lbf
-from tests.envs.adapters.tuple_helpers import act, check_advantages, check_same_course, train_save_load_evaluate
+from tests.envs.adapters.tuple_helpers import (
+    act,
+    check_advantages,
+    check_images_need_no_display,
+    check_same_course,
+    check_window_is_the_packages_own,
+    train_save_load_evaluate,
+)
 
 TWO, THREE = "Foraging-2s-8x8-2p-2f-coop-v3", "Foraging-2s-10x10-3p-3f-v3"
 NORTH, WEST, LOAD = 1, 3, 5
@@ -179,26 +186,11 @@ def test_making_one_warns_of_nothing(recwarn):
 
 
 def test_images_need_no_display():
-    pytest.importorskip("pygame")
-    env = lbf.make(TWO, render_mode="rgb_array")
-    env.reset(seed=0)
-    env.game.render = None  # the package's own, which opens a window
-    pictures = [env.render()]
-    for _ in range(5):
-        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-        pictures.append(env.render())
-    assert all(picture.dtype == np.uint8 and picture.shape == pictures[0].shape for picture in pictures)
-    assert pictures[0].shape[2] == 3 and any((picture != pictures[0]).any() for picture in pictures)
+    check_images_need_no_display(lbf.make(TWO, render_mode="rgb_array"))
 
 
 def test_the_window_is_the_packages_own():
-    env = lbf.make(TWO, render_mode="human")
-    asked = []
-    env.game.render = lambda mode="human": asked.append(mode)
-    env.reset(seed=0)
-    before = len(asked)
-    env.render()
-    assert asked[before:] == ["human"]
+    check_window_is_the_packages_own(lbf.make(TWO, render_mode="human"))
 
 
 @pytest.mark.parametrize("name", [TWO, THREE])

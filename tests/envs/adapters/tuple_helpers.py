@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -43,6 +44,37 @@ def check_same_course(env: Any, other: Any, n_steps: int) -> None:
             pair = act(env, *actions), act(other, *actions)
             assert pair[0][1:4] == pair[1][1:4] and env.agents == other.agents
         assert all(np.array_equal(pair[0][0][agent], pair[1][0][agent]) for agent in pair[0][0])
+
+
+def check_images_need_no_display(env: Any) -> None:
+    """
+    Check that pictures are our own drawings, and change with the game.
+
+    :param env: Made with ``render_mode="rgb_array"``
+    """
+    pytest.importorskip("pygame")
+    env.reset(seed=0)
+    env.game.render = None  # the package's own, which opens a window
+    pictures = [env.render()]
+    for _ in range(5):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        pictures.append(env.render())
+    assert all(picture.dtype == np.uint8 and picture.shape == pictures[0].shape for picture in pictures)
+    assert pictures[0].shape[2] == 3 and any((picture != pictures[0]).any() for picture in pictures)
+
+
+def check_window_is_the_packages_own(env: Any) -> None:
+    """
+    Check that a window is left to the package.
+
+    :param env: Made with ``render_mode="human"``
+    """
+    asked = []
+    env.game.render = lambda mode="human": asked.append(mode)
+    env.reset(seed=0)
+    before = len(asked)
+    env.render()
+    assert asked[before:] == ["human"]
 
 
 def train_save_load_evaluate(make_env: Callable[[], Any], folder: Any, algorithm: Any = BeliefPPO) -> list:
