@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.team.predictor import takes_masks
+from sb3_belief.vec_env.action_masks import mask_parts
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 # An agent that is not masked chooses what is impossible within its first random actions, or hardly ever
@@ -78,14 +79,8 @@ class MaskCheck:
 
 def _possible(space: spaces.Space, actions: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Return whether masks allow actions, bool ``[n_envs]``."""
-    if isinstance(space, spaces.Discrete):
-        widths, chosen = [int(space.n)], actions - space.start
-    elif isinstance(space, spaces.MultiDiscrete):
-        widths, chosen = space.nvec.ravel().tolist(), actions - space.start
-    else:
-        # MultiBinary has the flags of 0 and 1 for each number
-        widths, chosen = [2] * actions[0].size, actions
-    offsets = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(int)
+    offsets = np.cumsum([0, *mask_parts(space)[:-1]])
+    chosen = actions - getattr(space, "start", 0)
     allowed = np.take_along_axis(masks, chosen.reshape(len(masks), -1).astype(int) + offsets, axis=1)
     return np.logical_and.reduce(allowed, axis=1)
 

@@ -2,7 +2,8 @@
 
 import inspect
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,13 @@ def takes_masks(model: BaseAlgorithm) -> bool:
 
     :param model: Of an agent
     """
-    return "action_masks" in inspect.signature(model.predict).parameters
+    return _has_masks_argument(getattr(model.predict, "__func__", model.predict))
+
+
+@cache
+def _has_masks_argument(predict: Callable[..., Any]) -> bool:
+    # Asked for each agent at each prediction, and slow to find out
+    return "action_masks" in inspect.signature(predict).parameters
 
 
 class Predictor:

@@ -7,6 +7,7 @@ import pathlib
 import pickle
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import torch as th
@@ -24,7 +25,8 @@ _OWN = {"policy", "env", "seed", "verbose", "tensorboard_log"}
 _DERIVED = {"n_envs", "policy_class"}
 
 
-def algorithm_arguments(algo_class: type[BaseAlgorithm]) -> set[str]:
+@cache
+def algorithm_arguments(algo_class: type[BaseAlgorithm]) -> frozenset[str]:
     """
     Return the names of the arguments of an algorithm.
 
@@ -39,7 +41,7 @@ def algorithm_arguments(algo_class: type[BaseAlgorithm]) -> set[str]:
             names.update(parameters)
             if inspect.Parameter.VAR_KEYWORD not in kinds:
                 break
-    return {name for name in names - {"self", "args", "kwargs"} if not name.startswith("_")}
+    return frozenset(name for name in names - {"self", "args", "kwargs"} if not name.startswith("_"))
 
 
 class SB3Protocol:

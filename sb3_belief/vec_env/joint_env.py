@@ -147,7 +147,7 @@ class JointEnv(gym.Env):
         if self._forms is not None:
             obs, infos = self._forms.convert(obs, infos, self._where)
         separate_agents(self.env)
-        after = self._agents_told()
+        after = self.agents_in_play
         if not after:
             raise ValueError(f"agents is empty {self._where}: reset() must fill it with the agents that are in play.")
         self._check_possible_agents()
@@ -189,7 +189,7 @@ class JointEnv(gym.Env):
         if type(total) not in _NUMBERS:
             any_info = any_end = True
             as_usual = False
-            after = self._agents_told()
+            after = self.agents_in_play
             obs, rewards, terminations, truncations, infos = self._plain(result)
             agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
             total = sum(agent_rewards)
@@ -240,11 +240,6 @@ class JointEnv(gym.Env):
         obs, infos = self._forms.convert(obs, infos, self._where if self._t < 2 else None)
         return obs, rewards, terminations, truncations, infos
 
-    def _agents_told(self) -> list[str]:
-        """Return the agents in play, also where the environment has None for nobody."""
-        told = getattr(self._game, "agents", None)
-        return [] if told is None else list(told)
-
     def _plain(self, result: Any) -> StepParts:
         """Convert what a step returned, or find out what is wrong with it."""
         obs, rewards, terminations, truncations, infos = plain_step(result, self._where)
@@ -289,8 +284,9 @@ class JointEnv(gym.Env):
 
     @property
     def agents_in_play(self) -> list[str]:
-        """Names of the agents that are in play."""
-        return self._agents_told()
+        """Names of the agents that are in play, none also where the environment has None for nobody."""
+        told = getattr(self._game, "agents", None)
+        return [] if told is None else list(told)
 
     def close(self) -> None:
         """Close the environment."""

@@ -26,8 +26,6 @@ RESERVED = CONTRACT | {
     "truncated",
     "visible",
 }
-# What an agent's info may say of the agent alone
-_NOT_OF_THE_TEAM = frozenset(("next_active",))
 _NUMBERS = frozenset((int, float, bool, np.bool_, np.float64, np.float32, np.int64, np.int32, np.uint8, np.int8))
 _CONSTANTS = _NUMBERS | {str, type(None)}
 
@@ -59,15 +57,12 @@ def own_infos(infos: Mapping[str, Any], agents: Mapping[str, Any]) -> dict[str, 
                     own["next_active"] = bool(np.any(own["next_active"]))
                 by_agent[name] = own
                 for key, value in own.items():
-                    if key in _NOT_OF_THE_TEAM:
-                        continue
-                    if key in values:
-                        values[key].append(value)
-                    else:
-                        values[key] = [value]
+                    values.setdefault(key, []).append(value)
     if not by_agent:
         return team
     team["agent_infos"] = by_agent
+    # It says something of each agent alone
+    values.pop("next_active", None)
     for key, reported in values.items():
         if key not in team:
             numbers = _NUMBERS.issuperset(map(type, reported))

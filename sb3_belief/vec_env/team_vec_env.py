@@ -336,12 +336,11 @@ class ObservationStack:
         stacked: dict[str, Any] = {}
         for agent, parts in self._layout:
             for key, shape, dtype in parts:
+                rows = [obs[agent] if key is None else obs[agent][key] for obs in observations]
                 # concatenate() takes a third of the time of array()
+                array = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
                 if key is None:
-                    rows = [obs[agent] for obs in observations]
-                    stacked[agent] = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
+                    stacked[agent] = array
                 else:
-                    rows = [obs[agent][key] for obs in observations]
-                    array = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
                     stacked.setdefault(agent, {})[key] = array
         return stacked
