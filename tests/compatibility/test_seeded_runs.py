@@ -20,5 +20,6 @@ def test_a_seeded_run_is_as_recorded(name):
     found, expected = RUNS[name](), RECORDED[name]
     assert found.keys() == expected.keys()
     for agent, values in found.items():
-        # To the last digit on the machine that recorded them; another one's matrix products may round differently
-        np.testing.assert_allclose(values, expected[agent], rtol=1e-6, err_msg=agent)
+        # To the last digit on the machine that recorded them; another one's matrix products may round differently, which an
+        # update amplifies
+        np.testing.assert_allclose(values, expected[agent], rtol=1e-4, err_msg=agent)

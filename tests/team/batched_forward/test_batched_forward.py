@@ -113,8 +113,10 @@ def test_the_policies_that_act_together_are_the_ones_that_agree(monkeypatch, siz
     found = learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]})
     # One of the 25 passes is the test of whether they agree
     assert found == [3] * 25
-    # These layers are so small that batched products are rounded differently, so that the test is the only pass
-    assert learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [3, 1]}) == [3]
+    # Where batched products are rounded differently, the test is the only pass
+    monkeypatch.setattr(batcher, "_agrees", {})
+    monkeypatch.setattr(batcher, "_equal", lambda a, b: False)
+    assert learn_both_ways(monkeypatch, sizes, policy_kwargs={"net_arch": [64]}) == [3]
 
 
 class Hooked(BaseCallback):
