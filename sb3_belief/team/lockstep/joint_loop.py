@@ -32,6 +32,7 @@ from sb3_belief.team.lockstep.scheduler import (
     COUNTED,
     FINISHED,
     ROLLOUT_ENDED,
+    ROLLOUT_STARTS,
     AgentTask,
     Scheduler,
 )
@@ -53,7 +54,7 @@ class AgentGroup(Protocol):
 
     def start(self, first: TeamObs, masks: TeamObs | None, vote: bool) -> None:
         """
-        Run the agents up to their first actions.
+        Run the agents up to where they begin their first rollouts.
 
         :param first: Their observations, if the environment has been reset
         :param masks: The masks of all agents, if there are any
@@ -76,7 +77,10 @@ class AgentGroup(Protocol):
         """
 
     def end_rollouts(self) -> None:
-        """Let the agents that have ended a rollout train on it and choose their next actions."""
+        """Let the agents that have ended a rollout train on it."""
+
+    def start_rollouts(self) -> None:
+        """Let the agents that are to begin a rollout choose their first actions."""
 
     def act(self, agents: Sequence[str]) -> None:
         """
@@ -281,6 +285,7 @@ class JointLoop(Scheduler):
         learning, all_together = self._learning(), False
         rngs.to(rng)
         progress.on_rollout_start()
+        self._begin_rollouts(rngs)
         while learning:
             self._batch_forwards(rngs)
             all_together = len(learning) == len(tasks)
@@ -343,7 +348,6 @@ class JointLoop(Scheduler):
         if team_ended:
             ended.clear()
             progress.on_rollout_end()
-        # Each agent trains and chooses its next action in one turn
         self.n_rounds += 1
         for group in self._groups:
             if not set(now).isdisjoint(group.agents):
@@ -355,6 +359,16 @@ class JointLoop(Scheduler):
         progress.on_round_end(learning)
         if team_ended and learning:
             progress.on_rollout_start()
+        self._begin_rollouts(rngs)
+
+    def _begin_rollouts(self, rngs: RngSwitch) -> None:
+        """Let the agents that are to begin a rollout choose their first actions."""
+        starting = {agent for agent, task in self._tasks.items() if task.state == ROLLOUT_STARTS}
+        for group in self._groups:
+            if not starting.isdisjoint(group.agents):
+                group.start_rollouts()
+        self._start_rollouts(self._in_this_process(self._tasks), rngs)
+        self._join()
 
     def _step(self, actions: TeamObs) -> TeamStep:
         self.n_steps += 1

@@ -23,8 +23,9 @@ from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.vec_env.agent_vec_env import AgentStep, AgentTransition, AgentVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
-# Why an agent's coroutine has switched to the scheduler: it has chosen its actions, counted a step, or ended a rollout
-ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "acts", "counted", "rollout ended", "finished"
+# Why an agent's coroutine has switched to the scheduler: it is to begin a rollout, has chosen its actions, counted a step, or ended
+# a rollout
+ROLLOUT_STARTS, ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "rollout starts", "acts", "counted", "rollout ended", "finished"
 # Its policy waits for those of other agents, to make their forward passes in one batch
 BATCHES_FORWARD = "batches forward"
 
@@ -52,7 +53,7 @@ class AgentTask:
 
 class SyncCallback(CallbackList):
     """
-    Runs an agent's own callback, then waits for the other agents: at each step, and at the end of each rollout.
+    Runs an agent's own callback, then waits for the other agents: at each step, and at the beginning and end of each rollout.
 
     Without a callback of the agent's own, what SB3 does for one at every step would be wasted: it is overridden here.
 
@@ -71,6 +72,10 @@ class SyncCallback(CallbackList):
 
     def on_step(self) -> bool:
         return self._scheduler.vote(self._agent, super().on_step() if self.callbacks else True)
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        self._scheduler.wait(self._agent, ROLLOUT_STARTS)
 
     def _on_rollout_end(self) -> None:
         super()._on_rollout_end()
@@ -203,7 +208,7 @@ class Scheduler(ABC):
     # Turns
 
     def _start(self, agents: Iterable[str], rngs: RngSwitch) -> None:
-        """Run the agents up to their first actions."""
+        """Run the agents up to where they begin their first rollouts."""
         self._main = getcurrent()
         for agent in agents:
             task = self._tasks[agent]
@@ -221,6 +226,10 @@ class Scheduler(ABC):
 
     def _learning(self) -> list[str]:
         return [agent for agent, task in self._tasks.items() if task.state != FINISHED]
+
+    def _start_rollouts(self, agents: Iterable[str], rngs: RngSwitch) -> None:
+        """Let those agents that are to begin a rollout choose their first actions."""
+        self._take_turns([agent for agent in agents if self._tasks[agent].state == ROLLOUT_STARTS], rngs)
 
     def _take_turns(self, agents: Iterable[str], rngs: RngSwitch) -> None:
         """Resume the agents one after the other, each with its own random number generators."""

@@ -40,7 +40,7 @@ class GroupScheduler(Scheduler):
 
     def start(self, tasks: dict[str, AgentTask]) -> None:
         """
-        Run the agents up to their first actions.
+        Run the agents up to where they begin their first rollouts.
 
         :param tasks: The agents' tasks
         """
@@ -85,6 +85,12 @@ class GroupScheduler(Scheduler):
         self._take_turns(ended, self._rngs)
         self._end_turns(ended)
         return ended
+
+    def start_rollouts(self) -> None:
+        """Let the agents that are to begin a rollout choose their first actions."""
+        learning = self._learning()
+        self._start_rollouts(learning, self._rngs)
+        self._end_turns(learning)
 
     def act(self, agents: Sequence[str]) -> None:
         """

@@ -103,6 +103,9 @@ class RemoteAgents:
     def end_rollouts(self) -> None:
         self._send("end_rollouts")
 
+    def start_rollouts(self) -> None:
+        self._send("start_rollouts")
+
     def act(self, agents: Sequence[str]) -> None:
         self._send("act", agents)
 

@@ -305,7 +305,7 @@ def test_ctrl_c_within_a_message(way, monkeypatch):
 
     def half(connection, *args):
         calls.append(way)
-        if len(calls) == 12:
+        if len(calls) == 14:
             connection.send_bytes(b"half") if way == "send" else connection.recv_bytes()
             raise KeyboardInterrupt
         return whole(connection, *args)
@@ -315,7 +315,7 @@ def test_ctrl_c_within_a_message(way, monkeypatch):
     monkeypatch.setattr(workers, way, half)
     with pytest.raises(KeyboardInterrupt):
         team.learn(64)
-    assert len(calls) >= 12 and no_processes_stay()
+    assert len(calls) >= 14 and no_processes_stay()
     # What was in that process is lost, what was here is not, and the team can go on
     assert th.equal(before, parameters(team.agents["agent_0"])) and team.agents["agent_1"].num_timesteps > 16
     monkeypatch.undo()
