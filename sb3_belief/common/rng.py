@@ -4,6 +4,7 @@ import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -62,6 +63,19 @@ class RngState:
         # Asking for the state of a CUDA device would initialise CUDA in a process that does not use it
         if th.cuda.is_initialized():
             self._cuda = th.cuda.get_rng_state_all()
+
+    def get(self) -> dict[str, Any]:
+        """Return the state as plain data. It must not be the current one."""
+        return {"numpy": self._numpy.state, "torch": self._torch, "python": self.python, "cuda": list(self._cuda)}
+
+    def set(self, state: dict[str, Any]) -> None:
+        """
+        Take over a state. This must not be the current one.
+
+        :param state: As :meth:`get` returned it
+        """
+        self._numpy.state = state["numpy"]
+        self._torch, self.python, self._cuda = state["torch"], state["python"], state["cuda"]
 
     def become(self, other: "RngState") -> None:
         """
@@ -136,6 +150,17 @@ class RngSwitch:
         mtrand.set_bit_generator(bit_generator)
         np.random.set_state(state)
         self._exclusive.__exit__(None, None, None)
+
+    @contextmanager
+    def put_aside(self) -> Iterator[None]:
+        """No state is current within the block, so that each can be read and replaced."""
+        self._current.suspend()
+        self._first.python = random.getstate()
+        try:
+            yield
+        finally:
+            self._current.resume()
+            random.setstate(self._first.python)
 
     def to(self, rng: RngState) -> None:
         """

@@ -27,6 +27,25 @@ class Flags(NamedTuple):
     truncated: np.ndarray
 
 
+class StepRecord(NamedTuple):
+    """
+    The results of a joint step other than observations and team reward.
+
+    :param agent_rewards: Own rewards of the n agents
+    :param flags: What the step meant for each agent
+    :param visible: Whose action of this step each agent could observe, bool ``[n, n-1+n_scripted]``
+    :param action_masks: Masks of all agents for their next actions, side by side in one row (True for an agent that has none);
+        None if the environment has no masks
+    :param scripted_actions: Flattened actions of the scripted others, float32 ``[W_scripted]``; None if there are none
+    """
+
+    agent_rewards: list[float]
+    flags: Flags
+    visible: np.ndarray
+    action_masks: np.ndarray | None
+    scripted_actions: np.ndarray | None
+
+
 class Events(NamedTuple):
     """
     What happened to the agents in a joint step.

@@ -3,7 +3,7 @@
 from collections.abc import Callable, KeysView, Mapping
 from functools import partial
 from math import isfinite
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -11,8 +11,10 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.action_masks import mask_row, mask_width
-from sb3_belief.vec_env.events import Events, Flags, find_events, no_flags
+from sb3_belief.vec_env.copy_state import CopyState
+from sb3_belief.vec_env.events import Events, Flags, StepRecord, find_events, no_flags
 from sb3_belief.vec_env.observation_forms import ObservationForms, copied, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
 from sb3_belief.vec_env.returned import (
@@ -34,25 +36,6 @@ from sb3_belief.vec_env.visible import VisibleOthers
 Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
 # Types of infos, and of the sum of rewards if these are numbers
 _DICT, _NUMBERS = {dict}, {float, int, np.float64, np.float32, np.int64, np.int32}
-
-
-class StepRecord(NamedTuple):
-    """
-    The results of a joint step other than observations and team reward.
-
-    :param agent_rewards: Own rewards of the n agents
-    :param flags: What the step meant for each agent
-    :param visible: Whose action of this step each agent could observe, bool ``[n, n-1+n_scripted]``
-    :param action_masks: Masks of all agents for their next actions, side by side in one row (True for an agent that has none);
-        None if the environment has no masks
-    :param scripted_actions: Flattened actions of the scripted others, float32 ``[W_scripted]``; None if there are none
-    """
-
-    agent_rewards: list[float]
-    flags: Flags
-    visible: np.ndarray
-    action_masks: np.ndarray | None
-    scripted_actions: np.ndarray | None
 
 
 class JointEnv(gym.Env):
@@ -127,6 +110,7 @@ class JointEnv(gym.Env):
             if isinstance(space, spaces.Dict)
         ]
         self._copy, self._t = copy, 0
+        self._copy_state: CopyState | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
         """
@@ -147,6 +131,7 @@ class JointEnv(gym.Env):
         if self._forms is not None:
             obs, infos = self._forms.convert(obs, infos, self._where)
         separate_agents(self.env)
+        self._copy_state = self._copy_state or CopyState(self.env)
         after = self.agents_in_play
         if not after:
             raise ValueError(f"agents is empty {self._where}: reset() must fill it with the agents that are in play.")
@@ -277,6 +262,22 @@ class JointEnv(gym.Env):
             if cut and agent not in obs:
                 raise no_last_observation(agent, self._where)
         self._check_possible_agents()
+
+    def get_copy_state(self) -> tuple[Any, PlainData]:
+        """Return what decides how this copy goes on, to be called after a reset (see ``CopyState``)."""
+        assert self._copy_state is not None
+        return (self._t, self._has_masks, self._said_success), self._copy_state.get()
+
+    def set_copy_state(self, own: Any, state: PlainData) -> None:
+        """
+        Restore what :meth:`get_copy_state` returned, after a reset.
+
+        :param own: Its first part
+        :param state: Its second part
+        """
+        assert self._copy_state is not None
+        self._copy_state.set(state)
+        self._t, self._has_masks, self._said_success = own
 
     def render(self) -> Any:
         """Return what the environment's own ``render()`` returns."""

@@ -136,6 +136,17 @@ class ParallelTeamVecEnv(TeamVecEnv):
             self._checks.check_masks(self._masks, np.zeros(self.num_envs, dtype=int))
         return obs
 
+    def _copies_state(self) -> dict[str, Any]:
+        copies = self.venv.env_method("get_copy_state")
+        return {"copies": copies, "masks": self._masks, "unable": dict(self._checks.unable)}
+
+    def _set_copies_state(self, state: dict[str, Any]) -> None:
+        # An environment has all its parts only after a reset
+        self.reset()
+        for copy, parts in enumerate(state["copies"]):
+            self.venv.env_method("set_copy_state", *parts, indices=copy)
+        self._masks, self._checks.unable = state["masks"], state["unable"]
+
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         # Plain integers for Discrete: what PettingZoo environments are tested with. Copies of others: an environment may write
         # into them, and the models keep theirs

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.common.file_names import file_name
+from sb3_belief.common.plain_data import NotPlainError
 from sb3_belief.vec_env.observation_forms import parts_of
 from sb3_belief.vec_env.validation import check_spaces, difference
 
@@ -287,6 +288,42 @@ class TeamVecEnv(VecEnv):
             self._team_returns[env_idx] = 0.0
             self._agent_returns[env_idx] = 0.0
             self._lengths[env_idx] = 0
+
+    # Exact state
+
+    def exact_state(self) -> dict[str, Any]:
+        """
+        Return all that decides how the environment goes on, between two steps and after a reset (issue 17).
+
+        :return: Plain data for :meth:`set_exact_state`
+        :raises NotPlainError: If the environment holds what is not plain data; a team then begins new episodes instead
+        """
+        return {
+            "copies": self._copies_state(),
+            "returns": (self._team_returns.copy(), self._agent_returns.copy(), self._lengths.copy()),
+            "last": (self.last_rewards.copy(), self.last_dones.copy(), self.last_agent_rewards.copy()),
+            "reports_success": self.reports_success,
+        }
+
+    def set_exact_state(self, state: dict[str, Any]) -> None:
+        """
+        Go on where another environment of the same kind was.
+
+        :param state: As its :meth:`exact_state` returned it
+        :raises ValueError: If it does not fit this environment
+        """
+        self._set_copies_state(state["copies"])
+        self._team_returns, self._agent_returns, self._lengths = state["returns"]
+        self.last_rewards, self.last_dones, self.last_agent_rewards = state["last"]
+        self.reports_success = state["reports_success"]
+
+    def _copies_state(self) -> Any:
+        """Return what decides how the copies go on, as plain data."""
+        raise NotPlainError(f"{type(self).__name__} does not say in which state its copies are.")
+
+    def _set_copies_state(self, state: Any) -> None:
+        """Restore what ``_copies_state`` returned."""
+        raise NotImplementedError
 
     # Checks
 

@@ -6,7 +6,8 @@ import math
 import random
 import struct
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,13 @@ MOST_NODES = 20_000_000
 _POSITIONS = {"MT19937": ("state", "pos", 624), "Philox": (None, "buffer_pos", 4)}
 
 
-def decode(data: PlainData, allowed: kinds.Allowed, path: str = "", accepts: kinds.Accepts = lambda found: True) -> Any:
+def decode(
+    data: PlainData,
+    allowed: kinds.Allowed,
+    path: str = "",
+    accepts: kinds.Accepts = lambda found: True,
+    known: Mapping[str, Any] = MappingProxyType({}),
+) -> Any:
     """
     Rebuild an object from plain data.
 
@@ -33,10 +40,11 @@ def decode(data: PlainData, allowed: kinds.Allowed, path: str = "", accepts: kin
     :param allowed: Whether classes and functions of a module may be named. It is asked before the module is imported
     :param path: What the object is called in messages
     :param accepts: Whether a class, or a function, that has been found may be used
+    :param known: The objects by name that were not described
     :return: The object
     :raises ValueError: If the data is not as ``encode`` writes it, or names what is not allowed
     """
-    reader = _Decoder(data.blob, allowed, accepts)
+    reader = _Decoder(data.blob, allowed, accepts, known)
     try:
         value = reader.child(data.tree, "")
         if reader.position != len(data.blob):
@@ -47,8 +55,8 @@ def decode(data: PlainData, allowed: kinds.Allowed, path: str = "", accepts: kin
 
 
 class _Decoder:
-    def __init__(self, blob: bytes, allowed: kinds.Allowed, accepts: kinds.Accepts):
-        self._blob, self._allowed, self._accepts = memoryview(blob), allowed, accepts
+    def __init__(self, blob: bytes, allowed: kinds.Allowed, accepts: kinds.Accepts, known: Mapping[str, Any]):
+        self._blob, self._allowed, self._accepts, self._objects_here = memoryview(blob), allowed, accepts, known
         self._shared: dict[int, Any] = {}
         self._n_nodes = self._depth = 0
         # Arrays are taken one after the other, so no byte is read twice
@@ -201,6 +209,11 @@ class _Decoder:
 
     def _ref(self, data: dict[str, Any]) -> Any:
         return self._known(data.get("to"))
+
+    def _known_here(self, data: dict[str, Any]) -> Any:
+        if self._a(str, data["name"]) not in self._objects_here:
+            raise Misfit(f"there is no {data['name'][:100]!r} here")
+        return self._objects_here[data["name"]]
 
     def _float(self, data: dict[str, Any]) -> float:
         return struct.unpack(">d", bytes.fromhex(data["bits"]))[0]
@@ -357,6 +370,7 @@ _Reader = Callable[[_Decoder, dict[str, Any]], Any]
 # The keys of each kind besides "is" and "id", and what reads it
 _READERS: dict[str, tuple[set[str], _Reader]] = {
     "ref": (set(), _Decoder._ref),
+    "known": ({"name"}, _Decoder._known_here),
     "list": ({"of"}, _Decoder._list),
     "tuple": ({"of"}, _Decoder._tuple),
     "size": ({"of"}, _Decoder._size),

@@ -6,8 +6,9 @@ import pathlib
 import random
 import struct
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from math import isfinite
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,13 @@ _TH_DTYPES = {dtype: name for name, dtype in kinds.DTYPES.items()}
 _SAFE_INTS = 2**63
 
 
-def encode(value: Any, allowed: kinds.Allowed, path: str = "", accepts: kinds.Accepts = lambda found: True) -> PlainData:
+def encode(
+    value: Any,
+    allowed: kinds.Allowed,
+    path: str = "",
+    accepts: kinds.Accepts = lambda found: True,
+    known: Mapping[int, str] = MappingProxyType({}),
+) -> PlainData:
     """
     Describe an object as plain data.
 
@@ -31,10 +38,11 @@ def encode(value: Any, allowed: kinds.Allowed, path: str = "", accepts: kinds.Ac
     :param allowed: Whether classes and functions of a module may be named, as the reader will be told
     :param path: What the object is called in messages
     :param accepts: Whether a class, or a function, may be named, as the reader will be told
+    :param known: Names by ``id()`` of objects that are not described, since the reader has them
     :return: Plain data for ``decode``
     :raises NotPlainError: If a part of it cannot be described
     """
-    writer = _Encoder(allowed, accepts)
+    writer = _Encoder(allowed, accepts, known)
     try:
         tree = writer.child(value, "")
     except Misfit as error:
@@ -46,8 +54,8 @@ def encode(value: Any, allowed: kinds.Allowed, path: str = "", accepts: kinds.Ac
 
 
 class _Encoder:
-    def __init__(self, allowed: kinds.Allowed, accepts: kinds.Accepts):
-        self._allowed, self._accepts = allowed, accepts
+    def __init__(self, allowed: kinds.Allowed, accepts: kinds.Accepts, known: Mapping[int, str]):
+        self._allowed, self._accepts, self._known = allowed, accepts, known
         # The object is kept so that its id is not given to another one
         self._memo: dict[int, tuple[_Node, Any]] = {}
         self._n_shared = 0
@@ -69,6 +77,8 @@ class _Encoder:
             return {"is": "float", "bits": struct.pack(">d", value).hex()}
         if kind is int:
             return value if value.bit_length() < kinds.MAX_BITS else {"is": "int", "hex": hex(value)}
+        if id(value) in self._known:
+            return {"is": "known", "name": self._known[id(value)]}
         if id(value) in self._memo:
             return self._reference(value)
         if self._depth >= kinds.DEEPEST:
