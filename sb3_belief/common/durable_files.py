@@ -29,14 +29,14 @@ def replaced_file(path: str | os.PathLike[str], mode: str = "wb", **open_kwargs:
     the old file is untouched.
 
     :param path: The file; its folder must exist
-    :param mode: ``"wb"`` for bytes, ``"w"`` for text
+    :param mode: ``"wb"`` for bytes, ``"w"`` for text, ``"w+"`` for text that is read again meanwhile
     :param open_kwargs: Further arguments of ``open``, e.g. ``encoding``
     :return: The open file
     :raises ValueError: If the mode is another one
     :raises OSError: If the file cannot be written, for example because the disk is full
     """
-    if mode not in ("w", "wb"):
-        raise ValueError(f"A file is replaced as a whole: mode must be 'w' or 'wb', not {mode!r}.")
+    if mode not in ("w", "w+", "wb"):
+        raise ValueError(f"A file is replaced as a whole: mode must be 'w', 'w+' or 'wb', not {mode!r}.")
     target = Path(path)
     # In the same folder, since only there a rename replaces a file in one step. The name is cut, because names have a limit
     temporary = target.with_name(f".{target.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")

@@ -3,16 +3,17 @@
 import os
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from numbers import Number
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, make_output_format
+from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 from stable_baselines3.common.utils import get_latest_run_id, safe_mean
 
 from sb3_belief.common.file_names import file_name
+from sb3_belief.team.log_files import counters, open_logger, put_counters_back, sync_logger, table_state
 
 
 def _has_spread(key: str) -> bool:
@@ -55,6 +56,9 @@ class TeamLog:
     :param tensorboard_log: Folder for the TensorBoard runs ``<run_name>_<k>`` (the team) and
         ``<run_name>_<k>/agents/<agent>``; None for none
     :param run_name: Name of the run
+    :param continue_from: What ``state`` returned, for a run that goes on from there: with the same files, of which later rows
+        are dropped, and the same TensorBoard run. Where there are no such files, new ones begin
+    :raises ValueError: If a file is not the one that it was then
     """
 
     def __init__(
@@ -64,23 +68,34 @@ class TeamLog:
         log_dir: str | None,
         tensorboard_log: str | None,
         run_name: str = "Team",
+        continue_from: Mapping[str, Any] | None = None,
     ):
-        self.run_name = run_name
+        self.run_name = run_name if continue_from is None else str(continue_from["run_name"])
         # Values that each agent has dumped since the last table, and the outputs from which each key is excluded
         self.latest: dict[str, dict[str, Any]] = {}
         self._algorithms: dict[str, str] = {}
         self.excluded: dict[str, tuple[str, ...]] = {}
-        run_dir = None
+        before = continue_from or {}
+        # The folder of the TensorBoard run, and the first step of which a run before this one shows nothing in it
+        self._run: str | None = None
+        purge_step = None
         if tensorboard_log is not None:
-            run_dir = os.path.join(tensorboard_log, f"{run_name}_{get_latest_run_id(tensorboard_log, run_name) + 1}")
-        self.agent_loggers = {
-            agent: Logger(
-                None if log_dir is None else os.path.join(log_dir, "agents", file_name(agent)),
-                _files(log_dir, run_dir, "agents", file_name(agent)),
-            )
-            for agent in agents
-        }
-        self.team_logger = Logger(log_dir, _files(log_dir, run_dir))
+            if before.get("run") is None:
+                self._run = f"{run_name}_{get_latest_run_id(tensorboard_log, run_name) + 1}"
+            else:
+                self._run, purge_step = str(before["run"]), before["timesteps"] + 1
+                if self._run != os.path.basename(self._run):
+                    raise ValueError(f"The name of a TensorBoard run is that of a folder, not {self._run!r}.")
+
+        def logger(table: Mapping[str, Any] | None, *folder: str) -> Logger:
+            event_folder = None if self._run is None else os.path.join(str(tensorboard_log), self._run, *folder)
+            return open_logger(None if log_dir is None else os.path.join(log_dir, *folder), event_folder, table, purge_step)
+
+        tables = before.get("agent_tables", {})
+        self.agent_loggers = {agent: logger(tables.get(agent), "agents", file_name(agent)) for agent in agents}
+        self.team_logger = logger(before.get("team_table"))
+        # Those that the models use, which the user may have set
+        self._used = dict(self.agent_loggers)
         if verbose >= 1:
             # Longer keys than SB3's own: it refuses two that are equal when they are cut
             self.team_logger.output_formats.append(HumanOutputFormat(sys.stdout, max_length=100))
@@ -98,6 +113,7 @@ class TeamLog:
             model.set_logger(self.agent_loggers[agent])
         model.logger.output_formats.append(_LatestValues(agent, self))
         self._algorithms[agent] = type(model).__name__
+        self._used[agent] = model.logger
 
     def complete(self, learning: Iterable[str]) -> bool:
         """
@@ -140,6 +156,47 @@ class TeamLog:
             return key
         return f"train/{self._algorithms[agent]}/{name}"
 
+    def state(self, timesteps: int) -> dict[str, Any]:
+        """
+        Return how far the logs are, and what waits to be written, for a run that goes on from here.
+
+        :param timesteps: Number of the team's timesteps
+        :return: Plain data: numbers, texts, arrays, lists and dicts
+        """
+        return {
+            "run_name": self.run_name,
+            "run": self._run,
+            "timesteps": timesteps,
+            "team_table": table_state(self.team_logger),
+            "agent_tables": {agent: table_state(logger) for agent, logger in self.agent_loggers.items()},
+            "team_counters": counters(self.team_logger),
+            "agent_counters": {agent: counters(logger) for agent, logger in self._used.items()},
+            # Of which the means will be logged, of nothing else
+            "latest": {
+                agent: {key: float(value) for key, value in values.items() if isinstance(value, (Number, np.number))}  # type: ignore[arg-type]
+                for agent, values in self.latest.items()
+            },
+            "excluded": {key: list(outputs or ()) for key, outputs in self.excluded.items()},
+        }
+
+    def put_back(self, state: Mapping[str, Any]) -> None:
+        """
+        Have the loggers hold what waited to be written.
+
+        :param state: What ``state`` returned
+        """
+        put_counters_back(self.team_logger, state["team_counters"])
+        for agent, logger in self._used.items():
+            put_counters_back(logger, state["agent_counters"][agent])
+        self.latest.clear()
+        self.latest.update({agent: dict(values) for agent, values in state["latest"].items()})
+        self.excluded.update({key: tuple(outputs) for key, outputs in state["excluded"].items()})
+
+    def sync(self) -> None:
+        """Have the system write to the disk what it holds of the files."""
+        for logger in (self.team_logger, *self.agent_loggers.values()):
+            sync_logger(logger)
+
     def close(self) -> None:
         """Close the files, but not the standard output."""
         for logger in [self.team_logger, *self.agent_loggers.values()]:
@@ -176,12 +233,3 @@ def record_time(logger: Logger, iterations: int, num_timesteps: int, start_times
     logger.record("time/fps", int((num_timesteps - start_timesteps) / elapsed))
     logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
     logger.record("time/total_timesteps", num_timesteps, exclude="tensorboard")
-
-
-def _files(log_dir: str | None, run_dir: str | None, *folder: str) -> list[KVWriter]:
-    formats = []
-    if log_dir is not None:
-        formats.append(make_output_format("csv", os.path.join(log_dir, *folder)))
-    if run_dir is not None:
-        formats.append(make_output_format("tensorboard", os.path.join(run_dir, *folder)))
-    return formats

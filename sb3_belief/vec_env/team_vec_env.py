@@ -14,8 +14,8 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sb3_belief.common.file_names import file_name
 from sb3_belief.common.plain_data import NotPlainError
+from sb3_belief.vec_env.monitor_files import monitor_sizes, open_monitor_files
 from sb3_belief.vec_env.observation_forms import parts_of
 from sb3_belief.vec_env.validation import check_spaces, difference
 
@@ -238,7 +238,7 @@ class TeamVecEnv(VecEnv):
 
     # Monitoring
 
-    def start_monitor(self, folder: str) -> None:
+    def start_monitor(self, folder: str, continue_from: Mapping[str, Any] | None = None) -> None:
         """
         Start writing one row per finished episode in SB3's monitor format.
 
@@ -246,15 +246,30 @@ class TeamVecEnv(VecEnv):
         part of a path is quoted (see ``file_name``). Existing files are overwritten.
 
         :param folder: Folder of the files; it is created if it does not exist
+        :param continue_from: What ``monitor_state`` returned, for a run that goes on from there: later rows of the files are
+            dropped, and times count from their first start
+        :raises ValueError: If a file is shorter than it was then
         """
         for writer in self._writers:
             writer.close()
         self.monitor_dir = os.fspath(folder)
+        if continue_from is not None:
+            self._t_start = float(continue_from["t_start"])
         header: dict[str, float | str] = {"t_start": self._t_start, "env_id": type(self).__name__}
-        paths = [os.path.join(self.monitor_dir, Monitor.EXT)]
-        own = os.path.join(self.monitor_dir, "agents")
-        paths += [os.path.join(own, f"{file_name(agent)}.{Monitor.EXT}") for agent in self.possible_agents]
-        self._writers = [ResultsWriter(path, header, extra_keys=("is_success",)) for path in paths]
+        self._writers = open_monitor_files(self.monitor_dir, self.possible_agents, header, continue_from)
+
+    def monitor_state(self) -> dict[str, Any]:
+        """
+        Return how far the monitor files are, for ``start_monitor`` of a run that goes on from here.
+
+        :return: Plain numbers
+        """
+        return {"t_start": self._t_start, "sizes": monitor_sizes(self._writers)}
+
+    def sync_monitor(self) -> None:
+        """Have the system write to the disk what it holds of the monitor files."""
+        for writer in self._writers:
+            os.fsync(writer.file_handler.fileno())
 
     def _zero_episode_sums(self) -> None:
         self._team_returns = np.zeros(self.num_envs)

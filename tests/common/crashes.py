@@ -105,7 +105,8 @@ def recorded(folder, monkeypatch):
             return written
 
     def open_(path, mode, opener=None, **kwargs):
-        file = io.BufferedWriter(Raw(path, mode.replace("b", ""), opener=opener))
+        raw = Raw(path, mode.replace("b", ""), opener=opener)
+        file = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
         return file if "b" in mode else io.TextIOWrapper(file, **kwargs)
 
     with monkeypatch.context() as patched:

@@ -49,7 +49,7 @@ def test_text_is_encoded_as_said(tmp_path):
 
 
 def test_another_mode_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="'w' or 'wb', not 'ab'"), replaced_file(tmp_path / "a", "ab"):
+    with pytest.raises(ValueError, match="'w', 'w\\+' or 'wb', not 'ab'"), replaced_file(tmp_path / "a", "ab"):
         pass
     assert not list(tmp_path.iterdir())
 

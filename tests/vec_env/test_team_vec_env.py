@@ -1,7 +1,5 @@
 """TeamVecEnv: infos, monitoring, checks and worker processes."""
 
-import csv
-import json
 from functools import partial
 
 import numpy as np
@@ -198,45 +196,6 @@ def test_masks_are_those_of_the_current_observation(vec_env):
         assert "action_masks" not in infos[0]
     env.close()
     assert make_team_env(ToyEnv).action_masks() is None
-
-
-def monitor_rows(path):
-    """Return the rows of a monitor file, as SB3's ``load_results`` does, which needs pandas."""
-    with open(path) as file:
-        assert "t_start" in json.loads(file.readline()[1:])
-        return list(csv.DictReader(file))
-
-
-def test_monitor_files(tmp_path):
-    env = make_team_env(ScriptedEnv, n_envs=2)
-    env.start_monitor(tmp_path)
-    env.reset()
-    episodes = []
-    for _ in range(24):
-        _, _, _, infos = env.step({agent: np.zeros(2, int) for agent in ZEROS})
-        episodes += [info for info in infos if "episode" in info]
-    env.close()
-    assert len(episodes) == 6
-    rows = monitor_rows(tmp_path / "monitor.csv")
-    assert [float(row["r"]) for row in rows] == pytest.approx([info["episode"]["r"] for info in episodes], abs=1e-5)
-    assert [row["l"] for row in rows] == ["8"] * 6
-    assert [row["is_success"] for row in rows] == ["False"] * 2 + ["True"] * 2 + ["False"] * 2
-    rows = monitor_rows(tmp_path / "agents" / "cut.monitor.csv")
-    assert [float(row["r"]) for row in rows] == pytest.approx(
-        [info["agent_episode_rewards"][2] for info in episodes], abs=1e-5
-    )
-
-
-def test_monitor_dir_attribute(tmp_path):
-    env = make_team_env(partial(ToyEnv, limit=2))
-    env.monitor_dir = tmp_path
-    env.reset()
-    for _ in range(2):
-        env.step({"agent_0": [0], "agent_1": [0]})
-    env.close()
-    assert len(monitor_rows(tmp_path / "monitor.csv")) == 1
-    env.reset()
-    assert len(monitor_rows(tmp_path / "monitor.csv")) == 1
 
 
 def test_evaluate_policy_trusts_the_built_in_monitor(recwarn):
