@@ -12,8 +12,9 @@ import pickle
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -23,6 +24,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_belief.common.file_names import file_name
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.versions import versions
 
 # Version of the layout above
@@ -42,6 +44,7 @@ class SavedTeam:
     manifest: dict[str, Any]
     models: dict[str, bytes]
     statistics: dict[str, VecNormalize]
+    parts: dict[str, PlainData] = field(default_factory=dict)
 
     def algo_class(self, agent: str) -> type[BaseAlgorithm]:
         """
@@ -114,6 +117,7 @@ def write_team(
     models: dict[str, BaseAlgorithm],
     statistics: dict[str, VecNormalize],
     manifest: dict[str, Any],
+    parts: Mapping[str, PlainData] = MappingProxyType({}),
 ) -> None:
     """
     Write a team's file.
@@ -128,7 +132,7 @@ def write_team(
     classes = {agent: f"{type(model).__module__}:{type(model).__qualname__}" for agent, model in models.items()}
     manifest = {"format": FORMAT, "agents": list(models), "classes": classes, **manifest, "versions": versions()}
     if isinstance(path, io.BufferedIOBase):
-        _write_archive(path, models, statistics, manifest)
+        _write_archive(path, models, statistics, manifest, parts)
         return
     target = pathlib.Path(path)
     if target.suffix == "":
@@ -137,7 +141,7 @@ def write_team(
     descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            _write_archive(file, models, statistics, manifest)
+            _write_archive(file, models, statistics, manifest, parts)
         # mkstemp() makes files that only their owner may read
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, target)
@@ -183,6 +187,13 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
                 raise ValueError(f"{path} has the team format {manifest.get('format')!r}; this version reads {FORMAT}.")
             files = {agent: agent_file(agent, names) for agent in manifest["agents"]}
             models = {agent: archive.read(f"{file}.zip") for agent, file in files.items()}
+            parts = {
+                name.removeprefix("parts/").removesuffix(".json"): PlainData(
+                    json.loads(archive.read(name)), archive.read(name.removesuffix("json") + "bin")
+                )
+                for name in names
+                if name.startswith("parts/") and name.endswith(".json")
+            }
             statistics = {
                 agent: pickle.loads(archive.read(f"{file}.vecnormalize.pkl"))
                 for agent, file in files.items()
@@ -190,7 +201,7 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase) -> SavedTeam:
             }
     except (zipfile.BadZipFile, json.JSONDecodeError, KeyError, EOFError, zlib.error, pickle.UnpicklingError) as error:
         raise ValueError(f"{path} is not a saved team, or it is damaged: {error}.") from error
-    return SavedTeam(manifest, models, statistics)
+    return SavedTeam(manifest, models, statistics, parts)
 
 
 def spaces_manifest(
@@ -213,12 +224,15 @@ def spaces_manifest(
 
 
 def _write_archive(
-    file: Any, models: dict[str, BaseAlgorithm], statistics: dict[str, VecNormalize], manifest: dict[str, Any]
+    file: Any, models: dict[str, BaseAlgorithm], statistics: dict[str, VecNormalize], manifest: dict[str, Any], parts: Mapping[str, PlainData]
 ) -> None:
     # Compressed, although weights hardly shrink: if the agents' zips were stored as they are, a file cut off after one of them
     # would end as a complete zip does, and be read as the zip of that agent
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("team.json", json.dumps(manifest, indent=2))
+        for name, part in parts.items():
+            archive.writestr(f"parts/{name}.json", json.dumps(part.tree))
+            archive.writestr(f"parts/{name}.bin", part.blob)
         for agent, model in models.items():
             buffer = io.BytesIO()
             model.save(buffer)

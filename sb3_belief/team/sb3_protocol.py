@@ -13,6 +13,7 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -61,9 +62,26 @@ class SB3Protocol:
         """The models by agent."""
         raise NotImplementedError
 
+    _logger: Logger | None
+
     def get_env(self) -> VecEnv | None:
         """Return the team's environment, if it has one."""
         raise NotImplementedError
+
+    @property
+    def logger(self) -> Logger:
+        """The team's logger, available from the first ``learn`` on."""
+        if self._logger is None:
+            raise AttributeError("A Team has a logger from its first learn() on, or from set_logger().")
+        return self._logger
+
+    def set_logger(self, logger: Logger) -> None:
+        """
+        Replace the logger of the team's table, which ``verbose``, ``log_dir`` and ``tensorboard_log`` set up by default.
+
+        :param logger: The new logger
+        """
+        self._logger = logger
 
     @property
     def observation_space(self) -> spaces.Dict:

@@ -22,6 +22,7 @@ from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, en
 from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
 from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
+from sb3_belief.team.exact import ExactTraining, check_exact_load
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
 from sb3_belief.team.masks import MaskCheck
@@ -129,6 +130,7 @@ class Team(SB3Protocol):
         self._log: TeamLog | None = None
         self._logger: Logger | None = None
         self._rng = team_rng(seed)
+        self._exact = ExactTraining(self, agents, self._rng)
         self._parallel = ParallelLearning(agents.models, agents.rngs, jobs)
         self._learning = False
         # Whether all agents' last observations are those of the environment's present state
@@ -149,21 +151,6 @@ class Team(SB3Protocol):
     @property
     def _models(self) -> dict[str, BaseAlgorithm]:
         return self._agents.models
-
-    @property
-    def logger(self) -> Logger:
-        """The team's logger, available from the first ``learn`` on."""
-        if self._logger is None:
-            raise AttributeError("A Team has a logger from its first learn() on, or from set_logger().")
-        return self._logger
-
-    def set_logger(self, logger: Logger) -> None:
-        """
-        Replace the logger of the team's table, which ``verbose``, ``log_dir`` and ``tensorboard_log`` set up by default.
-
-        :param logger: The new logger
-        """
-        self._logger = logger
 
     def learn(
         self: SelfTeam,
@@ -194,7 +181,8 @@ class Team(SB3Protocol):
         :return: The team
         :raises RuntimeError: If the team is learning already, or if another does in another thread
         :raises ValueError: If it has no environment, if agents are unknown, if the run has another name already, if something
-            was set on the team that belongs to its models, or if the ``EvalCallback`` of an agent has another's environment
+            was set on the team that belongs to its models, if the ``EvalCallback`` of an agent has another's environment, or if
+            a team that was loaded to go on exactly is to begin anew
         """
         if self._learning:
             raise RuntimeError("This team is learning already: learn() cannot be called by a callback or an agent of its own.")
@@ -205,6 +193,7 @@ class Team(SB3Protocol):
         team_callback = as_callback(callback, progress_bar)
         check_callbacks(self._models, bool(self._agents.statistics), team_callback, own_callbacks)
         self.check_learn(total_timesteps)
+        self._exact.check_learn(reset_num_timesteps)
         with self._exclusively():
             log = self._make_log(tb_log_name)
             if reset_num_timesteps:
@@ -222,10 +211,11 @@ class Team(SB3Protocol):
             tasks = self._agents.tasks(learn, own_callbacks)
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
             self._can_continue = False
+            loop.at_first_rollout = partial(self._exact.at_first_rollout, loop, log)
             with self.shown_arguments():
                 progress = TeamProgress(self, team_callback, log)
-            with RngSwitch(self._rng):
-                if fresh:
+            with RngSwitch(self._rng) as rngs:
+                if not self._exact.begin(loop, team_callback, rngs) and fresh:
                     for model in self.agents.values():
                         model._last_obs = None
                     loop.reset()
@@ -285,21 +275,26 @@ class Team(SB3Protocol):
         """Whether a model takes action masks: then evaluate with sb3-contrib's ``MaskableEvalCallback``."""
         return self._predictor.takes_masks
 
-    def save(self, path: str | os.PathLike | io.BufferedIOBase) -> None:
+    def save(self, path: str | os.PathLike | io.BufferedIOBase, exact: bool = False) -> None:
         """
         Save the team as one zip. Each ``agents/<agent>.zip`` in it is a normal SB3 zip that loads and predicts alone.
 
         An existing file is replaced only when the new one is complete.
 
         :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
+        :param exact: Whether to save all that decides how the training goes on, so that ``Team.load(path, env, exact=True)``
+            resumes it bit for bit: in the ``_on_rollout_start()`` of a team's callback, or after ``learn()``
+        :raises ValueError: If that is asked for elsewhere
         """
+        # First, since an environment without a readable state begins new episodes
+        state = self._exact.read(self._loop, self._learning, self._can_continue, self._log) if exact else None
         manifest = {
             "seed": self.seed,
             "num_timesteps": self.num_timesteps,
             "normalize": self.normalize,
             **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
-        write_team(path, self.agents, self._agents.statistics, manifest)
+        write_team(path, self.agents, self._agents.statistics, manifest, {} if state is None else state.parts())
 
     @classmethod
     def load(
@@ -314,10 +309,11 @@ class Team(SB3Protocol):
         tensorboard_log: str | None = None,
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
+        exact: bool = False,
         **kwargs: Any,
     ) -> SelfTeam:
         """
-        Load a saved team. As with SB3 the random number generators start anew from its seed.
+        Load a saved team. As with SB3 the random number generators start anew from its seed, unless ``exact`` is set.
 
         :param path: Path of a saved team, with or without ".zip", or an open binary file
         :param env: Environment to learn in, whose number of copies may differ; None for a team that can only predict
@@ -329,6 +325,9 @@ class Team(SB3Protocol):
         :param tensorboard_log: As in the constructor
         :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
         :param jobs: As in the constructor
+        :param exact: Whether the next ``learn(..., reset_num_timesteps=False)`` goes on bit for bit where the team was saved with
+            ``exact=True``: episodes, random numbers, buffers, logs, and callbacks if the same ones are given in the same order.
+            Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
         :param kwargs: Arguments of the algorithms that replace the saved ones (``learning_rate=1e-5``), and ``seed``, which
             replaces that of the team
         :return: The team
@@ -337,6 +336,8 @@ class Team(SB3Protocol):
         :raises ValueError: If it is damaged or no saved team, if the environment does not fit it, or if ``jobs`` is wrong
         """
         check_jobs(jobs)
+        if exact:
+            check_exact_load(env, {**kwargs, **(agent_kwargs or {})})
         saved = read_team(path)
         loop = None if env is None else JointLoop(check_team_vec_env(env))
         if loop is not None:
@@ -348,9 +349,21 @@ class Team(SB3Protocol):
         agents = AgentModels.load(saved, loop, seed, options)
         team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
         team.num_timesteps = manifest["num_timesteps"]
-        if env is not None and seed is not None:
+        if exact:
+            team._exact.load(saved.parts, loop)
+        elif env is not None and seed is not None:
             env.seed(env_seed(seed))
         return team
+
+    @property
+    def exact_needs_reset(self) -> bool:
+        """Whether the environment's state cannot be saved, so that ``save(exact=True)`` begins new episodes."""
+        return self._loop is not None and self._exact.needs_reset(self._loop)
+
+    @property
+    def monitor_state(self) -> dict[str, Any] | None:
+        """How far the monitor files were when the team was saved, for ``start_monitor``; until the team learns."""
+        return self._exact.monitor_state
 
     def get_env(self) -> VecEnv | None:
         """Return the team's environment, if it has one."""
@@ -386,7 +399,14 @@ class Team(SB3Protocol):
 
     def _make_log(self, run_name: str | None) -> TeamLog:
         if self._log is None:
-            self._log = TeamLog(self.possible_agents, self.verbose, self._log_dir, self.tensorboard_log, run_name or "Team")
+            self._log = TeamLog(
+                self.possible_agents,
+                self.verbose,
+                self._log_dir,
+                self.tensorboard_log,
+                run_name or "Team",
+                continue_from=self._exact.log_state,
+            )
             for agent, model in self.agents.items():
                 self._log.connect(agent, model)
             if self._logger is None:

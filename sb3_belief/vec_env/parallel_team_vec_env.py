@@ -1,5 +1,6 @@
 """``TeamVecEnv`` over copies of a PettingZoo ``ParallelEnv``, in this process or in workers, held by SB3's own vectorisers."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
@@ -9,6 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_belief.common.exceptions import add_note
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.action_masks import mask_parts, mask_width
 from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
 from sb3_belief.vec_env.observation_forms import parts_of
@@ -137,14 +139,15 @@ class ParallelTeamVecEnv(TeamVecEnv):
         return obs
 
     def _copies_state(self) -> dict[str, Any]:
-        copies = self.venv.env_method("get_copy_state")
+        # As text, which takes less than the tree when it is written once more
+        copies = [(own, json.dumps(state.tree), state.blob) for own, state in self.venv.env_method("get_copy_state")]
         return {"copies": copies, "masks": self._masks, "unable": dict(self._checks.unable)}
 
     def _set_copies_state(self, state: dict[str, Any]) -> None:
         # An environment has all its parts only after a reset
         self.reset()
-        for copy, parts in enumerate(state["copies"]):
-            self.venv.env_method("set_copy_state", *parts, indices=copy)
+        for copy, (own, tree, blob) in enumerate(state["copies"]):
+            self.venv.env_method("set_copy_state", own, PlainData(json.loads(tree), blob), indices=copy)
         self._masks, self._checks.unable = state["masks"], state["unable"]
 
     def _step_joint(self, actions: TeamObs) -> TeamStep:

@@ -8,7 +8,7 @@ nothing lies in SB3's local variables.
 import inspect
 import warnings
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -24,7 +24,6 @@ from torch import nn
 
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState
-from sb3_belief.team.sb3_protocol import algorithm_arguments
 
 #: Packages whose classes the state of an agent may name; those of the agent's own model come on top
 PACKAGES = ("stable_baselines3", "sb3_contrib", "sb3_belief", "torch", "numpy", "gymnasium")
@@ -38,19 +37,7 @@ _NOISE_MATRICES = ("exploration_mat", "exploration_matrices")
 _OF_WRAPPER = {"venv", "class_attributes", "num_envs"}
 
 
-class AgentState(NamedTuple):
-    """
-    The state of an agent.
-
-    :param model: What its model goes on from
-    :param packages: Packages whose classes it names
-    """
-
-    model: PlainData
-    packages: tuple[str, ...]
-
-
-def read_agent_state(model: BaseAlgorithm, rng: RngState) -> AgentState:
+def read_agent_state(model: BaseAlgorithm, rng: RngState) -> PlainData:
     """
     Return what decides how an agent goes on learning.
 
@@ -62,15 +49,16 @@ def read_agent_state(model: BaseAlgorithm, rng: RngState) -> AgentState:
     """
     state: dict[str, Any] = {
         "rng": rng.get(),
+        # Off-policy algorithms explore by sampling from it
+        "action_space": model.action_space._np_random,
         "attributes": _attributes(model),
         "modules": {path: dict(_numbers(module)) for path, module in _modules(model)},
         "noise": {path: matrices for path, matrices in _noise_matrices(model)},
         "buffers": {name: _buffer_state(buffer) for name, buffer in _buffers(model)},
         "wrappers": [_wrapper_state(wrapper) for wrapper in _wrappers(model.env)],
     }
-    packages = (*PACKAGES, type(model).__module__.partition(".")[0])
     try:
-        return AgentState(encode(state, _any_module), packages)
+        return encode(state, _any_module)
     except NotPlainError:
         left_out = [name for name, value in state["attributes"].items() if not _is_plain(value)]
         for name in left_out:
@@ -80,10 +68,10 @@ def read_agent_state(model: BaseAlgorithm, rng: RngState) -> AgentState:
             " resumed from there may differ from an undisturbed training.",
             stacklevel=2,
         )
-        return AgentState(encode(state, _any_module, type(model).__name__), packages)
+        return encode(state, _any_module, type(model).__name__)
 
 
-def write_agent_state(model: BaseAlgorithm, rng: RngState, state: AgentState) -> None:
+def write_agent_state(model: BaseAlgorithm, rng: RngState, state: PlainData) -> None:
     """
     Put an agent's state back.
 
@@ -94,7 +82,7 @@ def write_agent_state(model: BaseAlgorithm, rng: RngState, state: AgentState) ->
     """
     # The model itself has been loaded, so its own package is trusted already
     known = {*PACKAGES, type(model).__module__.partition(".")[0]}
-    saved = decode(state.model, lambda module: module.partition(".")[0] in known, "state")
+    saved = decode(state, lambda module: module.partition(".")[0] in known, "state")
     try:
         _put_back(model, saved)
         rng.set(saved["rng"])
@@ -115,15 +103,16 @@ def _is_plain(value: Any) -> bool:
 
 
 def _attributes(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return what learning changes in a model: not what its constructor was given, which may be replaced at a load."""
-    settings = algorithm_arguments(type(model))
-    found = {}
-    for name, value in vars(model).items():
-        if isinstance(value, ActionNoise):
-            found[name] = value
-        elif not (name in settings or name in _OF_LEARN or isinstance(value, _NO_STATE) or callable(value)):
-            found[name] = value
-    return found
+    """
+    Return the numbers, arrays and containers that a model holds. Settings are among them, because SB3 changes some of them
+    while it makes a model, and changes them once more at a load (DQN's ``target_update_interval``).
+    """
+    return {
+        name: value
+        for name, value in vars(model).items()
+        if isinstance(value, ActionNoise)
+        or not (name in _OF_LEARN or name.endswith("_kwargs") or isinstance(value, _NO_STATE) or callable(value))
+    }
 
 
 def _modules(model: BaseAlgorithm) -> Iterator[tuple[str, nn.Module]]:
@@ -155,7 +144,7 @@ def _buffers(model: BaseAlgorithm) -> Iterator[tuple[str, BaseBuffer]]:
 
 
 def _buffer_state(buffer: BaseBuffer) -> dict[str, Any]:
-    values = {name: value for name, value in vars(buffer).items() if not isinstance(value, _NO_STATE)}
+    values = {name: value for name, value in vars(buffer).items() if not (isinstance(value, _NO_STATE) or callable(value))}
     if isinstance(buffer, RolloutBuffer):
         return {name: value for name, value in values.items() if name not in _OF_ROLLOUT and not _holds_arrays(value)}
     n_rows = buffer.buffer_size if buffer.full else buffer.pos + 1
@@ -192,6 +181,7 @@ def _wrapper_state(wrapper: VecEnvWrapper) -> dict[str, Any]:
 
 @th.no_grad()
 def _put_back(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
+    model.action_space._np_random = saved["action_space"]
     _put_into(model, saved["attributes"])
     for path, numbers in saved["modules"].items():
         module = recursive_getattr(model.policy, path) if path else model.policy

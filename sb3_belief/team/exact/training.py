@@ -8,35 +8,23 @@ from there runs up to the same place, where everything is put back, over whateve
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_belief.common.file_names import file_name
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState, RngSwitch
-from sb3_belief.team.exact.agent_state import PACKAGES, AgentState, read_agent_state, write_agent_state
+from sb3_belief.team.agent_models import AgentModels
+from sb3_belief.team.exact.agent_state import PACKAGES, read_agent_state, write_agent_state
 from sb3_belief.team.exact.counted import callback_states, restore_callbacks, restore_wrappers, wrapper_states
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.logs import TeamLog
 
 _TEAM = "exact/team"
 _COUNTERS = ("num_timesteps", "_iterations", "ep_info_buffer", "ep_success_buffer")
-
-
-class TrainingTeam(Protocol):
-    """What is read and put back of a ``Team``."""
-
-    seed: int | None
-    num_timesteps: int
-    possible_agents: list[str]
-
-    @property
-    def agents(self) -> dict[str, BaseAlgorithm]:
-        """The models by agent, up to date."""
 
 
 class ExactState(NamedTuple):
@@ -59,17 +47,34 @@ def _part(agent: str) -> str:
     return f"exact/agents/{file_name(agent)}"
 
 
+def check_exact_load(env: Any, settings: Mapping[str, Any]) -> None:
+    """
+    Check that a team that is to go on exactly is loaded as it was.
+
+    :param env: The environment
+    :param settings: Arguments that would replace saved ones
+    :raises ValueError: If there is no environment, or are such arguments
+    """
+    if env is None:
+        raise ValueError("A training goes on in an environment: Team.load(path, env=env, exact=True), made as it was before.")
+    if settings:
+        raise ValueError(
+            f"A training that goes on exactly keeps its settings, but load() was given {sorted(settings)}: leave them out, or load"
+            " the team without exact=True."
+        )
+
+
 class ExactTraining:
     """
     Reads a team's exact state, and puts one back when the team begins to learn.
 
     :param team: The team
+    :param agents: Its models with what belongs to them
     :param rng: The team's own random number generators
-    :param rngs: Those of its agents
     """
 
-    def __init__(self, team: Any, rng: RngState, rngs: Mapping[str, RngState]):
-        self._team, self._rng, self._rngs = team, rng, rngs
+    def __init__(self, team: Any, agents: AgentModels, rng: RngState):
+        self._team, self._models, self._rngs, self._rng = team, agents.models, agents.rngs, rng
         self._pending: dict[str, Any] | None = None
         self._pending_agents: dict[str, PlainData] = {}
         self._callback: BaseCallback | None = None
@@ -105,8 +110,7 @@ class ExactTraining:
                 "counters": {name: getattr(self._team, name) for name in _COUNTERS},
                 "env": env,
                 "wrappers": wrapper_states(loop.env),
-                "obs": dict(loop.last_obs),
-                "starts": dict(loop.last_starts),
+                "last": loop.last,
                 "rng": self._rng.get(),
                 "callbacks": callback_states(self._callback) if learning else None,
                 "agent_callbacks": {agent: callback_states(each) for agent, each in loop.callbacks.items()},
@@ -148,14 +152,15 @@ class ExactTraining:
 
     # Going on
 
-    def load(self, parts: Mapping[str, Any], loop: JointLoop) -> None:
+    def load(self, parts: Mapping[str, PlainData], loop: JointLoop | None) -> None:
         """
         Keep a state until the team begins to learn.
 
         :param parts: The parts of a team's file
         :param loop: The team's loop
-        :raises ValueError: If there is no exact state among them, or one of another number of copies
+        :raises ValueError: If there is no exact state among them, or one of another number of copies, or no environment
         """
+        assert loop is not None
         names = {agent: _part(agent) for agent in self._team.possible_agents}
         missing = [name for name in (_TEAM, *names.values()) if name not in parts]
         if missing:
@@ -187,30 +192,44 @@ class ExactTraining:
         """Whether a state waits to be put back."""
         return self._pending is not None
 
-    def begin(self, loop: JointLoop, callback: BaseCallback, rngs: RngSwitch) -> None:
+    def check_learn(self, reset_num_timesteps: bool) -> None:
+        """
+        Check that a training that is to go on exactly does not begin anew.
+
+        :param reset_num_timesteps: As ``learn()`` was given it
+        :raises ValueError: If it does
+        """
+        if self._pending is not None and reset_num_timesteps:
+            raise ValueError(
+                "This team was loaded with exact=True, to go on where it was saved: call learn(remaining steps,"
+                " reset_num_timesteps=False). To begin anew load it without exact=True."
+            )
+
+    def begin(self, loop: JointLoop, callback: BaseCallback, rngs: RngSwitch) -> bool:
         """
         Put back what a training begins with.
 
         :param loop: The team's loop
         :param callback: The team's callback
         :param rngs: Lends the global random number generators
+        :return: Whether there was a state to go on from
         """
         self._callback = callback
         state = self._pending
         if state is None:
-            return
+            return False
         if "seed" in state["env"]:
             loop.env.seed(state["env"]["seed"])
             loop.reset()
         else:
             loop.team_env.set_exact_state(state["env"])
         restore_wrappers(loop.env, state["wrappers"])
-        loop.continue_from(state["obs"], state["starts"])
-        models = self._team.agents
+        loop.continue_from(*state["last"])
         with rngs.put_aside():
-            for agent, model in models.items():
+            for agent, model in self._models.items():
                 write_agent_state(model, self._rngs[agent], self._pending_agents[agent])
             self._rng.set(state["rng"])
+        return True
 
     def at_first_rollout(self, loop: JointLoop, log: TeamLog) -> None:
         """
@@ -228,7 +247,7 @@ class ExactTraining:
         if not state["in_rollout"]:
             return
         with loop.put_rngs_aside():
-            for agent, model in self._team.models_here.items():
+            for agent, model in self._models.items():
                 write_agent_state(model, self._rngs[agent], agents[agent])
             self._rng.set(state["rng"])
         loop.restore_groups(agents)
@@ -236,15 +255,11 @@ class ExactTraining:
         for agent, callback in loop.callbacks.items():
             restore_callbacks(callback, state["agent_callbacks"].get(agent, []), repr(agent))
 
-    def end(self) -> None:
-        """Forget the callback of a training."""
-        self._callback = None
-
 
 def _begin_episodes(model: BaseAlgorithm) -> None:
     """Give a model the first observations of new episodes, as SB3 does when it begins to learn."""
     assert model.env is not None
     model._last_obs = model.env.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones((model.env.num_envs,), dtype=bool)
-    if model._vec_normalize_env is not None and isinstance(model, OffPolicyAlgorithm):
+    if model._vec_normalize_env is not None:
         model._last_original_obs = model._vec_normalize_env.get_original_obs()

@@ -15,7 +15,8 @@ team's callbacks share another one.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from copy import deepcopy
 from typing import Any, Protocol
 
@@ -25,7 +26,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.exceptions import add_note
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.team.lockstep.agent_group import AgentGroup
 from sb3_belief.team.lockstep.scheduler import (
     ACTS,
     BATCHES_FORWARD,
@@ -39,63 +42,8 @@ from sb3_belief.team.lockstep.scheduler import (
 from sb3_belief.team.lockstep.wrapper_check import WrapperCheck
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.masks import MaskCheck
-from sb3_belief.vec_env.agent_vec_env import AgentTransition, TransitionSplitter
+from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
-
-
-class AgentGroup(Protocol):
-    """
-    Agents of the team whose models learn in another process, in lockstep with those in this one.
-
-    :param agents: Their names
-    """
-
-    agents: list[str]
-
-    def start(self, first: TeamObs, masks: TeamObs | None, vote: bool) -> None:
-        """
-        Run the agents up to where they begin their first rollouts.
-
-        :param first: Their observations, if the environment has been reset
-        :param masks: The masks of all agents, if there are any
-        :param vote: Whether a callback may run between counting a step and what follows
-        """
-
-    def step(self, transitions: dict[str, AgentTransition], masks: TeamObs | None) -> None:
-        """
-        Let the agents count the step and, where there is no vote, finish it.
-
-        :param transitions: The parts of all agents
-        :param masks: The masks of all agents, if there are any
-        """
-
-    def finish_step(self, continues: bool) -> None:
-        """
-        Let the agents do what follows after counting the step.
-
-        :param continues: Whether training continues
-        """
-
-    def end_rollouts(self) -> None:
-        """Let the agents that have ended a rollout train on it."""
-
-    def start_rollouts(self) -> None:
-        """Let the agents that are to begin a rollout choose their first actions."""
-
-    def act(self, agents: Sequence[str]) -> None:
-        """
-        Let agents act that have finished learning.
-
-        :param agents: Their names
-        """
-
-    def result(self) -> tuple[dict[str, str], TeamObs]:
-        """
-        Wait for what was asked of the group last.
-
-        :return: The state and the actions of each agent that has been resumed since the last result
-        :raises BaseException: Whatever one of the agents raised
-        """
 
 
 class LearningTeam(Protocol):
@@ -194,15 +142,17 @@ class JointLoop(Scheduler):
     def __init__(self, env: VecEnv):
         team_env = env.unwrapped
         assert isinstance(team_env, TeamVecEnv)
-        self.env = env
+        self.env, self.team_env = env, team_env
         self.possible_agents = list(team_env.possible_agents)
-        self._team_env = team_env
         self._wrapper_check = WrapperCheck(env)
         #: Watches the first steps for actions that masks forbid
         self.mask_check: MaskCheck | None = None
         self._masks: dict[str, np.ndarray] | None = None
         self._masks_known = False
         self._groups: Sequence[AgentGroup] = ()
+        self._rngs: RngSwitch | None = None
+        #: Called once, where all agents begin their first rollout
+        self.at_first_rollout: Callable[[], None] | None = None
         #: The agents that learn in these groups
         self._elsewhere: set[str] = set()
         self.n_steps = 0
@@ -224,7 +174,7 @@ class JointLoop(Scheduler):
     @property
     def masks(self) -> dict[str, np.ndarray] | None:
         if not self._masks_known:
-            self._masks, self._masks_known = self._team_env.action_masks(), True
+            self._masks, self._masks_known = self.team_env.action_masks(), True
         return self._masks
 
     def get_images(self) -> Sequence[np.ndarray | None]:
@@ -236,6 +186,47 @@ class JointLoop(Scheduler):
         self._masks_known = False
         self._first = {agent: self._obs[agent] for agent in self.possible_agents}
         self._starts = {agent: np.ones(self.num_envs, dtype=bool) for agent in self.possible_agents}
+
+    # The exact state (team/exact)
+
+    @property
+    def begins_rollouts(self) -> bool:
+        """Whether all agents are about to begin a rollout."""
+        return bool(self._tasks) and all(task.state == ROLLOUT_STARTS for task in self._tasks.values())
+
+    @property
+    def last(self) -> tuple[TeamObs, dict[str, np.ndarray]]:
+        """The present observations and whether episodes have begun with them, by agent."""
+        return dict(self._obs), dict(self._starts)
+
+    @property
+    def callbacks(self) -> dict[str, BaseCallback]:
+        """The agents' own callbacks."""
+        return {agent: task.callback for agent, task in self._tasks.items() if task.callback is not None}
+
+    def continue_from(self, obs: TeamObs, starts: dict[str, np.ndarray]) -> None:
+        """
+        Go on with episodes that are under way.
+
+        :param obs: The present observations by agent
+        :param starts: Whether episodes have begun with them, by agent
+        """
+        self._obs, self._starts, self._first, self._masks_known = obs, starts, {}, False
+
+    def put_rngs_aside(self) -> AbstractContextManager[None]:
+        """Within the block no random number generators of the team are the current ones. Only while agents learn."""
+        assert self._rngs is not None
+        return self._rngs.put_aside()
+
+    def restore_groups(self, states: dict[str, PlainData]) -> None:
+        """
+        Put the states of the agents back that learn in other processes.
+
+        :param states: Of all agents
+        """
+        for group in self._groups:
+            group.restore({agent: states[agent] for agent in group.agents})
+        self._join()
 
     def run(
         self, tasks: dict[str, AgentTask], progress: TeamProgress, rng: RngState, groups: Sequence[AgentGroup] = ()
@@ -258,6 +249,7 @@ class JointLoop(Scheduler):
         self._vote = progress.has_callback or any(task.callback is not None for task in tasks.values())
         try:
             with RngSwitch(rng) as rngs:
+                self._rngs = rngs
                 try:
                     return self._run(progress, rng, rngs)
                 except BaseException as error:
@@ -269,7 +261,7 @@ class JointLoop(Scheduler):
                     )
                     raise
         finally:
-            self._main, self._tasks = None, {}
+            self._main, self._rngs, self._tasks = None, None, {}
             self._groups, self._elsewhere = (), set()
             self._transitions, self._actions = {}, {}
 
@@ -284,6 +276,8 @@ class JointLoop(Scheduler):
         ended: set[str] = set()
         learning, all_together = self._learning(), False
         rngs.to(rng)
+        if self.at_first_rollout is not None:
+            self.at_first_rollout()
         progress.on_rollout_start()
         self._begin_rollouts(rngs)
         while learning:

@@ -8,6 +8,7 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.rng import RngState
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.parallel.messages import dumps, loads
@@ -23,7 +24,7 @@ _shown: dict[Any, Any] = {}
 
 class RemoteAgents:
     """
-    An agent group (see ``joint_loop.AgentGroup``) that learns in a worker.
+    An agent group (see ``lockstep.agent_group``) that learns in a worker.
 
     :param loop: The team's loop
     :param workers: The worker processes
@@ -105,6 +106,9 @@ class RemoteAgents:
 
     def start_rollouts(self) -> None:
         self._send("start_rollouts")
+
+    def restore(self, states: dict[str, PlainData]) -> None:
+        self._send("restore", states)
 
     def act(self, agents: Sequence[str]) -> None:
         self._send("act", agents)

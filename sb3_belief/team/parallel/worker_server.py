@@ -13,9 +13,11 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 
+from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.processes import leave_interrupts_to_main
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.batched_forward import batched_forwards
+from sb3_belief.team.exact.agent_state import write_agent_state
 from sb3_belief.team.lockstep.scheduler import AgentTask
 from sb3_belief.team.own_code import runs_own_code
 from sb3_belief.team.parallel.group_scheduler import GroupScheduler
@@ -55,7 +57,7 @@ class Command(NamedTuple):
 
 
 # Commands that are about the models, too; the others go to the scheduler
-_OWN = ("open", "end_rollouts", "sync", "close")
+_OWN = ("open", "end_rollouts", "restore", "sync", "close")
 # Attributes of a wrapper that belong to the process it is in
 _OF_THE_PROCESS = ("venv", "class_attributes")
 
@@ -191,6 +193,15 @@ class WorkerServer:
             # A model that cannot be sent back is better found out now than when there is much to lose
             self._readers[agent].read(with_buffer=False)
             self._unread.remove(agent)
+
+    def restore(self, states: dict[str, PlainData]) -> None:
+        """
+        Put the agents' exact states back.
+
+        :param states: By agent
+        """
+        for agent, state in states.items():
+            write_agent_state(self._models[agent], self._rngs[agent], state)
 
     def sync(self) -> None:
         """Send the models' states, without their rollout buffers."""
