@@ -196,7 +196,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         write_model(path, buffer.getvalue())
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfBelief],
         path: str | os.PathLike[str] | io.BufferedIOBase,
         env: GymEnv | None = None,
@@ -227,7 +227,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         content, where = read_model(path)
         trust = Trust.of(trust_pickle, allow_packages)
         options = dict(env=env, device=device, print_system_info=print_system_info, force_reset=force_reset)
-        return load_model_zip(super().load, content, where, trust, custom_objects, **options, **kwargs)  # type: ignore[arg-type]
+        return load_model_zip(super().load, content, where, trust, custom_objects, **options, **kwargs)
 
     # -- rollout -------------------------------------------------------------------------------------------------------
 

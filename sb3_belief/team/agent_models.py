@@ -1,6 +1,5 @@
 """The models of a team with what belongs to each of them: how they are built, loaded and moved to another environment."""
 
-import io
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -192,9 +191,7 @@ class AgentModels:
         :raises TypeError: If an algorithm has no argument of a name that is given
         :raises ValueError: If agents are unknown
         """
-        statistics: dict[str, VecNormalize] = {
-            agent: AgentNormalize.from_saved(each) for agent, each in saved.statistics.items()
-        }
+        statistics = saved.statistics
         agents = AgentModels(statistics=statistics)
         names = saved.manifest["agents"]
         check_agent_keys("agent_kwargs", options.agent_kwargs, names)
@@ -210,8 +207,8 @@ class AgentModels:
                 arguments[agent].setdefault("seed", own_seed)
             agents.rngs[agent] = rng_state(own_seed)
             with RngSwitch(agents.rngs[agent]):
-                agents.models[agent] = classes[agent].load(
-                    io.BytesIO(saved.models[agent]),
+                agents.models[agent] = saved.load_model(
+                    agent,
                     env=env,
                     device=options.device,
                     custom_objects=options.custom_objects,

@@ -66,7 +66,7 @@ def _warn_of_checkpoints(callback: BaseCallback, is_normalised: bool) -> None:
         if is_normalised and isinstance(each, CheckpointCallback) and each.save_vecnormalize:
             warnings.warn(
                 "CheckpointCallback(save_vecnormalize=True) writes no file of its own for a Team: each agent's statistics are"
-                " in the team's zip (agents/<agent>.vecnormalize.pkl), and Team.load() restores them."
+                " in the team's zip (agents/<agent>.vecnormalize.json), and Team.load() restores them."
             )
 
 

@@ -53,9 +53,12 @@ class SB3Protocol:
     ``team.learning_rate``, where all agents have the same value.
     """
 
+    #: Of the team, ``AgentModels``
+    _agents: Any
+
     @property
     def _models(self) -> dict[str, BaseAlgorithm]:
-        raise NotImplementedError
+        return self._agents.models
 
     @property
     def agents(self) -> dict[str, BaseAlgorithm]:
@@ -181,7 +184,8 @@ class SB3Protocol:
         """
         given = load_path_or_dict
         if not isinstance(given, Mapping):
-            given = {agent: io.BytesIO(content) for agent, content in read_team(given).models.items()}
+            files: Mapping[str, Any] = read_team(given).parameter_files()
+            given = files
         models = self.agents
         check_agent_keys("load_path_or_dict", given, list(models))
         missing = [agent for agent in models if agent not in given]

@@ -4,7 +4,7 @@ import io
 import os
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, TypeVar
@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.rng import RngSwitch, global_rngs_of_this_thread
+from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, env_seed, run_learn, team_rng
 from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
 from sb3_belief.team.callbacks import check_callbacks
@@ -148,10 +149,6 @@ class Team(SB3Protocol):
         self._parallel.sync_models()
         return self._agents.models
 
-    @property
-    def _models(self) -> dict[str, BaseAlgorithm]:
-        return self._agents.models
-
     def learn(
         self: SelfTeam,
         total_timesteps: int,
@@ -191,7 +188,7 @@ class Team(SB3Protocol):
             raise ValueError("This team has no environment to learn in: use set_env(), or Team.load(path, env=env).")
         own_callbacks = agent_callbacks or {}
         team_callback = as_callback(callback, progress_bar)
-        check_callbacks(self._models, bool(self._agents.statistics), team_callback, own_callbacks)
+        check_callbacks(self._agents.models, bool(self._agents.statistics), team_callback, own_callbacks)
         self.check_learn(total_timesteps)
         self._exact.check_learn(reset_num_timesteps)
         with self._exclusively():
@@ -223,7 +220,7 @@ class Team(SB3Protocol):
                 progress.on_training_start(
                     {"self": self, "total_timesteps": total, "tb_log_name": log.run_name, "env": loop.env}
                 )
-            loop.mask_check = MaskCheck(self._models, loop.masks)
+            loop.mask_check = MaskCheck(self._agents.models, loop.masks)
             with self._parallel.distribute(loop, tasks, learn, team_callback) as groups:
                 in_step = loop.run(tasks, progress, self._rng, groups)
             with RngSwitch(self._rng):
@@ -310,10 +307,12 @@ class Team(SB3Protocol):
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
         exact: bool = False,
+        trust_pickle: bool = False,
+        allow_packages: Iterable[str] = (),
         **kwargs: Any,
     ) -> SelfTeam:
         """
-        Load a saved team. As with SB3 the random number generators start anew from its seed, unless ``exact`` is set.
+        Load a saved team, running nothing of whoever made it. Random numbers start anew from its seed, unless ``exact`` is set.
 
         :param path: Path of a saved team, with or without ".zip", or an open binary file
         :param env: Environment to learn in, whose number of copies may differ; None for a team that can only predict
@@ -328,17 +327,20 @@ class Team(SB3Protocol):
         :param exact: Whether the next ``learn(..., reset_num_timesteps=False)`` goes on bit for bit where the team was saved with
             ``exact=True``: episodes, random numbers, buffers, logs, and callbacks if the same ones are given in the same order.
             Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
+        :param trust_pickle: Whether to read pickles (older files, functions), which can run any code of whoever made the file
+        :param allow_packages: Packages of your own of which the file may name classes and functions
         :param kwargs: Arguments of the algorithms that replace the saved ones (``learning_rate=1e-5``), and ``seed``, which
             replaces that of the team
         :return: The team
         :raises FileNotFoundError: If there is no such file
         :raises TypeError: If an agent's algorithm has no argument of that name
-        :raises ValueError: If it is damaged or no saved team, if the environment does not fit it, or if ``jobs`` is wrong
+        :raises ValueError: If it is damaged, no team or not trusted, the environment does not fit it, or ``jobs`` is wrong
         """
         check_jobs(jobs)
         if exact:
             check_exact_load(env, {**kwargs, **(agent_kwargs or {})})
         saved = read_team(path)
+@@        saved = read_team(path, Trust.of(trust_pickle, allow_packages))
         loop = None if env is None else JointLoop(check_team_vec_env(env))
         if loop is not None:
             saved.check_env(loop.env, loop.possible_agents, loop.scripted)

@@ -6,16 +6,23 @@ be kept up to date.
 """
 
 import inspect
+import re
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_belief.common.safe_files.trust import is_allowed
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import resolve
+
+# Arguments by which callbacks and wrappers are told where to write
+_PATH = re.compile(r"(path|dir|directory|folder|file|file_?name)$")
 
 
 @dataclass(frozen=True)
@@ -25,10 +32,12 @@ class Location:
 
     :param text: File and section, or flag, followed by the keys that lead to the setting
     :param extra_packages: See ``names.resolve``
+    :param run_folder: Folder of the run whose file it is; None if the user gave it, or trusts the file
     """
 
     text: str
     extra_packages: tuple[str, ...] = ()
+    run_folder: Path | None = None
 
     def key(self, name: str) -> "Location":
         """
@@ -37,12 +46,41 @@ class Location:
         :param name: Its key
         :return: The location
         """
-        return Location(f"{self.text}: {name}", self.extra_packages)
+        return replace(self, text=f"{self.text}: {name}")
 
     @property
     def parent(self) -> str:
         """Text of the location that this setting lies in."""
         return self.text.rpartition(": ")[0]
+
+
+def check_run_file(function: Callable[..., Any], arguments: Mapping[str, Any], location: Location) -> None:
+    """
+    Check what the configuration of another's run lets a callback or a wrapper do.
+
+    :param function: The callback or wrapper
+    :param arguments: Its arguments
+    :param location: Where they are given
+    :raises ConfigError: If it could write outside of the run's folder, or is nothing that wraps a team's environment
+    """
+    if location.run_folder is None or is_allowed(function.__module__, location.extra_packages):
+        return
+    folder = location.run_folder.resolve()
+    is_callback = inspect.isclass(function) and issubclass(function, BaseCallback)
+    if not is_callback and not is_allowed(function.__module__, ("sb3_belief", "supersuit", "pettingzoo")):
+        raise ConfigError(
+            f"{location.text}: {function.__module__}.{function.__name__} is no wrapper of a team's environment, and the file"
+            " of a run may name no other function. If you trust it: --trust."
+        )
+    for name, value in arguments.items():
+        if not isinstance(value, str) or not _PATH.search(name):
+            continue
+        # Joined to a folder an absolute path remains what it is
+        if not (Path.cwd() / value).resolve().is_relative_to(folder):
+            raise ConfigError(
+                f"{location.text}: {name}: {short(value)} lies outside of the run's folder {str(location.run_folder)!r}, where"
+                " the file of a run may not write. If you trust it: --trust, or give your own file with --conf-file."
+            )
 
 
 class _Mismatch(Exception):

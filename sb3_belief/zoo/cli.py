@@ -322,7 +322,7 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
     if args.trained_agent is None:
         config = load_config(args.algo or _ALGO, args.env or _ENV, **settings)
     else:
-        config = resume_config(args.trained_agent, args.algo, args.env, **settings)
+        config = resume_config(args.trained_agent, args.algo, args.env, trust=args.trust, **settings)
     names = (
         "log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq"
         " vec_env device num_threads jobs progress trained_agent trust verbose"

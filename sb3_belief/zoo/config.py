@@ -145,6 +145,7 @@ def load_config(
     n_timesteps: int | None = None,
     extra_packages: tuple[str, ...] = (),
     eval_env_kwargs: Sequence[str] = (),
+    run_folder: Path | None = None,
 ) -> RunConfig:
     """
     Load, merge and check the settings of a run.
@@ -160,6 +161,7 @@ def load_config(
     :param n_timesteps: Number of joint steps to train for, or None for the file's
     :param extra_packages: See ``names.resolve``
     :param eval_env_kwargs: ``key:value`` pairs of arguments of the environment of evaluations, which override ``env_kwargs``
+    :param run_folder: Folder of the run whose file ``conf_file`` is, if its author may be a stranger, who may write there only
     :return: The configuration
     :raises ConfigError: For a setting that does not fit. The message names its location, what is allowed and the nearest match
     """
@@ -174,16 +176,18 @@ def load_config(
         existing = ", ".join(sections) or "none"
         raise ConfigError(f"{path}: has no section {env_id!r} and no section {DEFAULT!r}; it has {existing}.")
 
-    given: list[tuple[str, Any]] = [
-        (f"{path}, section {name}", sections[name]) for name in (DEFAULT, env_id) if name in sections
+    in_file = [
+        (Location(f"{path}, section {name}", extra_packages, run_folder), sections[name] or {})
+        for name in (DEFAULT, env_id)
+        if name in sections
     ]
-    given.append(("-params", parse_pairs(params, "-params")))
+    given: list[tuple[str, Any]] = [("-params", parse_pairs(params, "-params"))]
     for flag, pairs in (("--env-kwargs", env_kwargs), ("--eval-env-kwargs", eval_env_kwargs)):
         if pairs:
             given.append((flag, {flag[2:].replace("-", "_"): parse_pairs(pairs, flag)}))
     if n_timesteps is not None:
         given.append(("--n-timesteps", {"n_timesteps": n_timesteps}))
-    layers = [(Location(text, extra_packages), layer or {}) for text, layer in given]
+    layers = in_file + [(Location(text, extra_packages), layer or {}) for text, layer in given]
     for location, layer in layers:
         if not isinstance(layer, dict):
             raise ConfigError(f"{location.text}: must be a mapping of settings, not {short(layer)}.")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_call
@@ -18,7 +19,6 @@ from sb3_belief.zoo.evaluate import Outcome
 from sb3_belief.zoo.names import get_env, load_env
 from sb3_belief.zoo.preflight import check_device, check_output
 from sb3_belief.zoo.run_folder import CONFIG, RECORD, check_record, find_team, run_of
-from sb3_belief.zoo.trust import check_saved_team
 from sb3_belief.zoo.yaml_data import parse_pairs
 
 # Least side of a picture in pixels, as far as whole factors allow it
@@ -40,8 +40,8 @@ class EnjoyOptions:
     :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
     :param fps: Frames per second of the file, or None for the environment's own rate
     :param env_kwargs: ``key:value`` pairs of arguments of the environment, which override those of the run
-    :param extra_packages: See ``names.resolve`` and ``trust.check_saved_team``
-    :param trust: Whether to load the team without looking at what it names
+    :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
+    :param trust: Whether to load the team, and what its run's folder names, even if that could run any code
     :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     """
 
@@ -74,13 +74,11 @@ def enjoy(options: EnjoyOptions) -> Outcome:
     check_device(options.device)
     path = find_team(options.run, "enjoy")
     shown = _environment_of(path, options)
-    if not options.trust:
-        check_saved_team(path, "enjoy", options.extra_packages)
     shown = _with_render_mode(shown, options)
     with _refusals_as_config_errors(shown):
         env = make_team_env(shown.env_id, seed=options.seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
     try:
-        team = _load_team(path, env, options.device)
+        team = _load_team(path, env, options)
         # This comes after loading, which seeds the environment as in the training
         env.seed(options.seed)
         frames: list[np.ndarray] | None = None if options.output is None else []
@@ -147,8 +145,11 @@ def _environment_of(team: Path, options: EnjoyOptions) -> _Shown:
             " name it with --env, and its arguments with --env-kwargs."
         )
     algo, env_id, conf_file = run
-    check_record(run, packages)
-    config = load_config(algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=packages)
+    check_record(run, packages, trust=options.trust)
+    folder = None if options.trust else conf_file.parent
+    config = load_config(
+        algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=packages, run_folder=folder
+    )
     return _Shown(config.env_id, config.env_kwargs, config.wrapper)
 
 
@@ -173,9 +174,10 @@ def _with_render_mode(shown: _Shown, options: EnjoyOptions) -> _Shown:
     return shown
 
 
-def _load_team(path: Path, env: TeamVecEnv, device: str) -> Team:
+def _load_team(path: Path, env: TeamVecEnv, options: EnjoyOptions) -> Team:
     try:
-        return Team.load(path, env=env, device=device)
+        trust = Trust.of(options.trust, options.extra_packages)
+        return Team.load(path, env=env, device=options.device, **trust._asdict())
     # A damaged file makes zipfile, pickle and torch raise whatever they raise
     except Exception as error:
         raise ConfigError(f"enjoy: {str(path)!r} cannot be loaded: {cause(error)}") from error

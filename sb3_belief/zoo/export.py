@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch as th
 
+from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.export import FORMATS, export_model
 from sb3_belief.team.fixed_partners.partners import load_model
 from sb3_belief.zoo.errors import ConfigError, cause, suggestion
 from sb3_belief.zoo.preflight import check_output
 from sb3_belief.zoo.run_folder import find_team, folder_name
-from sb3_belief.zoo.trust import check_saved_team
 
 
 def export(
@@ -27,7 +27,7 @@ def export(
     :param given: ``"TEAM:agent"``, where TEAM is the zip of a team or the folder of a run, or the zip of a single agent
     :param file_format: A key of ``FORMATS``
     :param output: Path of the file; None for the agent's name in the current folder
-    :param extra_packages: See ``trust.check_saved_team``
+    :param extra_packages: Packages of which the file may name classes, besides the known ones
     :param trust: Whether to load a file even if it could run any code
     :return: Path of the file
     :raises ConfigError: If there is no such agent, or it cannot be exported
@@ -42,10 +42,8 @@ def export(
     if agents is not None and agent not in agents:
         unknown = "name" if agent is None else f"{str(path)!r} has no agent {agent!r}.{suggestion(agent, agents)} Name"
         raise ConfigError(f"export: {unknown} the agent: {team}:agent, one of {agents}.")
-    if not trust:
-        check_saved_team(path, "export", extra_packages, or_single_agent=True)
     try:
-        model, statistics = load_model(path, agent or "")
+        model, statistics = load_model(path, agent or "", Trust.of(trust, extra_packages))
         written = Path(output or folder_name(agent or path.stem) + FORMATS[file_format])
         graph = export_model(model, written, file_format, statistics)
     # A damaged file makes zipfile, pickle and torch raise whatever they raise, when it is read or when it is traced

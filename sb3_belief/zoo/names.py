@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_belief.common.safe_files.trust import is_allowed
 from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
 from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo.errors import ConfigError, cause, short, suggestion, unknown_setting
@@ -94,17 +96,6 @@ def get_algo(name: str, where: str = "--algo") -> Algo:
     if not isinstance(name, str) or name not in ALGOS:
         raise unknown_setting(where, "algorithm", name, ALGOS)
     return ALGOS[name]
-
-
-def is_allowed(module: str, packages: tuple[str, ...]) -> bool:
-    """
-    Return whether a module belongs to one of some packages.
-
-    :param module: Full name of the module
-    :param packages: Names of packages, or of parts of packages
-    :return: Whether it is one of them, or lies in one
-    """
-    return any(module == package or module.startswith(package + ".") for package in packages)
 
 
 def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
@@ -202,23 +193,42 @@ def _import_extra(package: str) -> None:
         raise ConfigError(f"--allow-package: {package!r} fails when it is imported: {cause(error)}.") from error
 
 
-def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:
+def load_env(env_id: str, where: str, extra_packages: tuple[str, ...] = (), of_file: bool = False) -> Callable[..., Any]:
     """
     Import and return the callable that makes one copy of an environment.
+
+    The id in a file of a run, whose author may be a stranger, names a registered environment, one of a suite, or a class of
+    PettingZoo's kinds. Another callable of an allowed package could do anything with the arguments that the file has for it.
 
     :param env_id: See ``get_env``
     :param where: Flag or command, for the error message
     :param extra_packages: See ``resolve``. A ``module:callable`` must belong to an allowed package
+    :param of_file: Whether a file of a run has the id, and not the user
     :return: The callable
     :raises ConfigError: For an id that is unknown or not allowed, or whose package is not installed
     """
+    if of_file and "/" in env_id and ":" in env_id:
+        # Gymnasium would import the module before the colon
+        raise ConfigError(f"{where}: {short(env_id)} names a module to import. If you trust the file, give it with --env.")
     found = get_env(env_id, where, extra_packages)
     # The specification of a "module:callable" holds the id itself. This kind can name any code, so the allow-list applies
     if found.parallel == env_id:
-        return resolve(env_id.replace(":", "."), where, extra_packages)
+        make = resolve(env_id.replace(":", "."), where, extra_packages)
+        if of_file and not is_allowed(make.__module__, extra_packages) and not _makes_env(make):
+            raise ConfigError(
+                f"{where}: {env_id!r} is no environment of PettingZoo's kinds, and a file may name no other callable. If you"
+                f" trust the file: --allow-package {make.__module__.partition('.')[0]}, or give it with --env."
+            )
+        return make
     try:
         return found.load()
     except ImportError as error:
         raise ConfigError(f"{where}: {error}") from error
     except Exception as error:
         raise ConfigError(f"{where}: {env_id} cannot be imported: {cause(error)}.") from error
+
+
+def _makes_env(make: Callable[..., Any]) -> bool:
+    if inspect.isclass(make):
+        return issubclass(make, (ParallelEnv, AECEnv))
+    return is_allowed(make.__module__, ("pettingzoo",)) and make.__name__ in ("parallel_env", "env", "raw_env")

@@ -19,6 +19,7 @@ def resume_config(
     env_id: str | None = None,
     conf_file: str | None = None,
     params: Sequence[str] = (),
+    trust: bool = False,
     **further: Any,
 ) -> RunConfig:
     """
@@ -34,6 +35,7 @@ def resume_config(
         default
     :param conf_file: See ``load_config``
     :param params: See ``load_config``
+    :param trust: Whether the files in the run's folder may name anything, and write anywhere
     :param further: Further arguments of ``load_config``; ``n_timesteps`` is the number of further joint steps
     :return: The configuration
     :raises ConfigError: For settings that do not fit the saved team, or that ``load_config`` refuses
@@ -48,13 +50,14 @@ def resume_config(
     run = run_of(find_team(trained, "--trained-agent"))
     if run is not None:
         saved_algo, saved_env, saved_conf = run
-        check_record(run, further.get("extra_packages", ()), of_env=env_id is None)
+        check_record(run, further.get("extra_packages", ()), of_env=env_id is None, trust=trust)
         algo, env_id = algo or saved_algo, env_id or saved_env
         if algo != saved_algo:
             raise ConfigError(f"--algo: {algo!r} does not fit the saved team, which is of {saved_algo!r}.")
         # The run's own file has a section for its own environment only
         if conf_file is None and env_id == saved_env:
             conf_file = str(saved_conf)
+            further["run_folder"] = None if trust else saved_conf.parent
     if algo is None or env_id is None:
         raise ConfigError(f"--trained-agent: {trained!r} is not in the folder of a run: give --algo and --env.")
     return load_config(algo, env_id, conf_file, params, **further)

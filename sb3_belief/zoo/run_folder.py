@@ -211,17 +211,20 @@ def run_of(team: Path) -> tuple[str, str, Path] | None:
     return None
 
 
-def check_record(run: tuple[str, str, Path], extra_packages: tuple[str, ...] = (), of_env: bool = True) -> None:
+def check_record(
+    run: tuple[str, str, Path], extra_packages: tuple[str, ...] = (), of_env: bool = True, trust: bool = False
+) -> None:
     """
     Check the algorithm and the environment that a run's record names, so that no flag is blamed for them.
 
     :param run: What ``run_of`` returns
     :param extra_packages: See ``names.resolve``
     :param of_env: Whether to check the environment too
+    :param trust: Whether the environment may be any callable of an allowed package
     :raises ConfigError: If there is no such algorithm, or no such environment. The message names the record
     """
     algo, env_id, conf_file = run
     record = conf_file.with_name(RECORD)
     get_algo(algo, f"{record}: algo")
     if of_env:
-        load_env(env_id, f"{record}: env", extra_packages)
+        load_env(env_id, f"{record}: env", extra_packages, of_file=not trust)

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_value
+from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_run_file, check_value
 from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.limits import check_limits
 from sb3_belief.zoo.names import Algo, resolve
@@ -161,6 +161,7 @@ class SettingsChecker:
                 if check is not None:
                     check(function, location)
                 arguments = check_call(function, arguments, location.key(path), skip=skip, complete=True)
+                check_run_file(function, arguments, location.key(path))
                 calls.append((function, arguments))
         return calls
 

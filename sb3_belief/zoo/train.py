@@ -14,6 +14,7 @@ import torch as th
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 
+from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
@@ -38,7 +39,6 @@ from sb3_belief.zoo.run_folder import (
     make_run_folder,
     remove_run_folder,
 )
-from sb3_belief.zoo.trust import check_saved_team
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class TrainOptions:
         learns wholly in one of them. The result is the same for any number, to the bit on the CPU. See ``Team``
     :param progress: Whether to show a progress bar
     :param trained_agent: Folder of a run, or zip of a team, whose training is to be continued
-    :param extra_packages: See ``trust.check_saved_team``
-    :param trust: Whether to load the saved team without looking at what it names
+    :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
+    :param trust: Whether to load the saved team even if it could run any code
     :param verbose: 0 for no output, 1 for the team's tables, 2 for those of the agents too
     :param command: The words of the command line, recorded in ``run.json``
     """
@@ -112,8 +112,6 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
     :raises ConfigError: If the environment or the algorithm refuses its settings. Nothing has been written in this case
     """
     trained = None if options.trained_agent is None else find_team(options.trained_agent, "--trained-agent")
-    if trained is not None and not options.trust:
-        check_saved_team(trained, "--trained-agent", options.extra_packages)
     _check_options(config, options)
     seed = int(np.random.SeedSequence().generate_state(1)[0] % 2**31) if options.seed is None else options.seed
     if options.num_threads > 0:
@@ -254,7 +252,8 @@ def make_team(
         jobs=options.jobs,
     )
     if trained is not None:
-        return _load_team(config, trained, env, seed, common)
+        trust = Trust.of(options.trust, options.extra_packages)
+        return _load_team(config, trained, env, seed, {**common, **trust._asdict()})
     try:
         algo_class, policy, kwargs = _models(config, env)
         return Team(algo_class, policy, env, seed=seed, normalize=config.normalize, **common, **kwargs)

@@ -177,13 +177,15 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, length: int) -> bytes
     return b"".join(parts)
 
 
-def to_json(value: Any) -> bytes:
+def to_json(value: Any, indent: int | None = None) -> bytes:
     """
     Return JSON for a member.
 
     :param value: Plain data, whose order is kept
+    :param indent: Of each level, for people who read it
     """
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+    separators = (",", ":") if indent is None else None
+    return json.dumps(value, allow_nan=False, indent=indent, separators=separators).encode()
 
 
 def from_json(content: bytes, where: str, file_size: int) -> Any:

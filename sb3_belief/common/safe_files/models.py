@@ -1,8 +1,8 @@
 """
 Models as plain data, in the zip that Stable-Baselines3 writes.
 
-SB3 pickles what JSON cannot hold (spaces, classes, schedules). We add the same as plain data, so that SB3 loads the zip as ever,
-and we load it by SB3's own ``load`` with ``custom_objects``, which take the place of the pickles: these are never read.
+SB3 pickles what JSON cannot hold (spaces, classes, schedules). We add the same as plain data. SB3 loads the zip as ever, and
+we load it by SB3's own ``load`` with ``custom_objects``, which take the place of the pickles: these are never read.
 """
 
 import io
@@ -30,6 +30,19 @@ ENTRIES, ARRAYS = "sb3_belief.json", "sb3_belief.bin"
 FORMAT = 1
 _PICKLED = ":serialized:"
 Model = TypeVar("Model", bound=BaseAlgorithm)
+
+
+class NamedContent(io.BytesIO):
+    """
+    A file in memory that has a name, for messages.
+
+    :param content: Its contents
+    :param name: What it is called
+    """
+
+    def __init__(self, content: bytes, name: str):
+        super().__init__(content)
+        self.name = name
 
 
 def add_plain_data(file: BinaryIO, model: BaseAlgorithm) -> None:
@@ -82,7 +95,9 @@ def read_model(path: Any) -> tuple[bytes, str]:
     :param path: Path, or open binary file
     :return: Its contents, and what it is called in messages
     """
-    where = repr(os.fspath(path)) if isinstance(path, (str, os.PathLike)) else "The open file"
+    # Open files have a name, too, but for those in memory
+    name = os.fspath(path) if isinstance(path, (str, os.PathLike)) else getattr(path, "name", None)
+    where = "The open file" if name is None else str(name)
     file = open_path(pathlib.Path(path) if isinstance(path, os.PathLike) else path, "r", verbose=0, suffix="zip")
     try:
         return file.read(), where
@@ -147,10 +162,7 @@ def plain_objects(content: bytes, where: str, trust: Trust, given: Mapping[str, 
             f"{where} has been written by Stable-Baselines3 alone, or by an earlier version of this package, and has to be"
             f" unpickled: {PICKLE}. If you trust that person: trust_pickle=True (--trust)."
         )
-    members = read_archive(io.BytesIO(content), where)
-    for name in members:
-        if name.endswith(".pth"):
-            check_tensors(members[name], f"{where}, member {name!r}")
+    members = check_parameters(content, where)
     if trust.trust_pickle:
         return {}
     about = _about(members, where, len(content))
@@ -169,10 +181,26 @@ def plain_objects(content: bytes, where: str, trust: Trust, given: Mapping[str, 
         if key not in objects and key not in given:
             reason = str(about["pickled"].get(key, f"{ENTRIES} does not have it"))
             raise ValueError(
-                f"{where}: its entry {key!r} is there as a pickle only ({reason[:300]}), and {PICKLE}. If you trust that person:"
-                f" trust_pickle=True (--trust). Or replace it: custom_objects={{{key!r}: ...}}."
+                f"{where}: its entry {key!r} is there as a pickle only ({reason[:300]}), and {PICKLE}. If you trust that"
+                f" person: trust_pickle=True (--trust). Or replace it: custom_objects={{{key!r}: ...}}."
             )
     return objects
+
+
+def check_parameters(content: bytes, where: str) -> dict[str, bytes]:
+    """
+    Check a model's zip, and that its parameters are tensors.
+
+    :param content: The zip
+    :param where: What the file is called in messages
+    :return: Its members by name
+    :raises ValueError: If it is damaged or holds something else
+    """
+    members = read_archive(io.BytesIO(content), where)
+    for name in members:
+        if name.endswith(".pth"):
+            check_tensors(members[name], f"{where}, member {name!r}")
+    return members
 
 
 @contextmanager

@@ -74,7 +74,9 @@ def _members(archive: zipfile.ZipFile, size: int) -> tuple[bytes, dict[str, int]
     names = [each.filename for each in infos]
     folder = names[0].partition("/")[0]
     known = r"data\.pkl|byteorder|version|\.data/serialization_id|\.format_version|\.storage_alignment|data/\d+"
-    if any(not re.fullmatch(rf"{re.escape(folder)}/({known})", name, re.ASCII) for name in names) or len({*names}) != len(names):
+    if any(not re.fullmatch(rf"{re.escape(folder)}/({known})", name, re.ASCII) for name in names) or len({*names}) != len(
+        names
+    ):
         raise _Wrong(f"it has other members than torch writes: {names[:5]}")
     if any(each.compress_type or each.compress_size != each.file_size or each.flag_bits & 1 for each in infos):
         raise _Wrong("it has members that are compressed or encrypted")

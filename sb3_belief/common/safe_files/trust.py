@@ -70,6 +70,10 @@ class Trust(NamedTuple):
         return inspect.isclass(found) and issubclass(found, _KINDS)
 
 
+#: Trust in known packages only
+UNTRUSTED = Trust()
+
+
 def is_allowed(module: str, packages: Iterable[str]) -> bool:
     """
     Return whether a module belongs to one of some packages.

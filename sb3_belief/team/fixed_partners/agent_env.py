@@ -1,7 +1,7 @@
 """One agent of a team as a plain Gymnasium environment, in which fixed partners act for the others."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.envs.registry import make_parallel_env
 from sb3_belief.team.agent_models import agent_seed
 from sb3_belief.team.fixed_partners.partners import CallersRng, Partner, PartnerLike
@@ -41,8 +42,8 @@ class AgentEnv(gym.Env):
     - an SB3 model; if ``VecNormalize`` normalises its observations, they are normalised here too
     - the path of an SB3 zip, or of a saved team (whose agent of the same name acts; ``"team.zip:agent_0"`` chooses another)
     - a pair of such a model or path and the ``VecNormalize`` that it has learned in, or the path of the file that
-      ``VecNormalize.save`` wrote (which is unpickled); None for a model that needs none. The zip of a model does not say
-      whether it does; if such a file lies beside it, a warning asks for the pair
+      ``VecNormalize.save`` wrote (a pickle, so with ``trust_pickle``); None for a model that needs none. The zip of a model
+      does not say whether it does; if such a file lies beside it, a warning asks for the pair
     - an object with SB3's ``predict(obs, state, episode_start, deterministic)``
     - a callable ``obs -> action``
 
@@ -60,6 +61,9 @@ class AgentEnv(gym.Env):
     :param visibility: As for ``make_team_env``
     :param deterministic: Whether partners with a ``predict`` take their most likely actions; False samples, as in training
     :param render_mode: Render mode of the environment, for an id or a callable
+    :param trust_pickle: Whether to load what is pickled in the files of partners, too: files of SB3 alone and of earlier
+        versions, and those of ``VecNormalize.save``. A pickle can run any code of whoever made the file
+    :param allow_packages: Packages of your own of which the files of partners may name classes and functions
     :raises TypeError: If the environment or a partner is of an unsuitable type
     :raises ValueError: For an unknown agent, agents without a partner, or partners that do not fit
     """
@@ -76,7 +80,10 @@ class AgentEnv(gym.Env):
         visibility: Visibility | None = None,
         deterministic: bool = False,
         render_mode: str | None = None,
+        trust_pickle: bool = False,
+        allow_packages: Iterable[str] = (),
     ):
+        self._trust = Trust.of(trust_pickle, allow_packages)
         kwargs = dict(env_kwargs or {})
         if render_mode is not None:
             kwargs["render_mode"] = render_mode
@@ -148,6 +155,7 @@ class AgentEnv(gym.Env):
             self._joint.action_spaces[name],
             self._deterministic,
             self._seed_of(name),
+            self._trust,
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

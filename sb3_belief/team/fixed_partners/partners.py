@@ -1,7 +1,6 @@
 """Fixed partners of a learner: models, saved files and functions that choose the actions of an agent in a team."""
 
 import inspect
-import io
 import os
 import pathlib
 import pickle
@@ -21,7 +20,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.common.safe_files.archive import names_in
+from sb3_belief.common.safe_files.models import class_of, plain_objects
+from sb3_belief.common.safe_files.trust import PICKLE, UNTRUSTED, Trust
 from sb3_belief.team.checkpoint import as_models_see, read_team
+from sb3_belief.team.model_zips import find_algorithm, load_algorithm
 from sb3_belief.team.predictor import PolicyState, Predictor
 
 # That a partner was given no statistics, which is not the same as None
@@ -72,6 +75,7 @@ class Partner:
     :param action_space: Action space of the agent
     :param deterministic: Passed on to ``predict``: whether to take the most likely action instead of a sample
     :param seed: Seed of its random numbers; None takes one from the operating system's entropy
+    :param trust: Whom the files of partners may name
     :raises TypeError: If ``given`` cannot act
     :raises ValueError: If it has been made for other spaces, or if a zip cannot be read as a model
     """
@@ -84,6 +88,7 @@ class Partner:
         action_space: spaces.Space,
         deterministic: bool,
         seed: int | None = None,
+        trust: Trust = UNTRUSTED,
     ):
         self.rng = RngState(seed)
         self._name, self._deterministic = name, deterministic
@@ -98,11 +103,11 @@ class Partner:
                 _warn_of_statistics(name, given)
             # Building a network draws random numbers, which must not come from the learner's generators
             with RngSwitch(self.rng):
-                given, statistics = load_model(given, name)
+                given, statistics = load_model(given, name, trust)
         elif isinstance(given, BaseAlgorithm):
             statistics = given.get_vec_normalize_env()
         if own_statistics is not _UNKNOWN:
-            statistics = _statistics(name, own_statistics, observation_space)
+            statistics = _statistics(name, own_statistics, observation_space, trust)
         self._predictor: Predictor | None = None
         if isinstance(given, type) or not (callable(given) or hasattr(given, "predict")):
             raise TypeError(
@@ -150,15 +155,17 @@ class Partner:
             self.rng = RngState(seed)
 
 
-def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecNormalize | None]:
+def load_model(path: str | os.PathLike, agent: str, trust: Trust = UNTRUSTED) -> tuple[BaseAlgorithm, VecNormalize | None]:
     """
     Load the model of a partner.
 
     :param path: Path of an SB3 zip or of a saved team, with or without ".zip", or ``"team.zip:<agent>"``
     :param agent: Name of the agent whose model is taken from a saved team, unless the path names one
+    :param trust: Whom the file may name
     :return: The model, and its normalisation if the team's file has one
     :raises FileNotFoundError: If there is no such file
-    :raises ValueError: If it is damaged, lacks the agent, or holds a model of an algorithm that is not known here
+    :raises ValueError: If it is damaged, lacks the agent, needs trust that it is not given, or holds a model of an algorithm
+        that is not known here
     """
     file = os.fspath(path)
     # The name of an agent may contain a colon, too
@@ -169,26 +176,29 @@ def load_model(path: str | os.PathLike, agent: str) -> tuple[BaseAlgorithm, VecN
         file = f"{file}.zip"
     if not pathlib.Path(file).is_file():
         raise FileNotFoundError(f"There is no {file!r} to load a partner from.")
-    try:
-        with zipfile.ZipFile(file) as archive:
-            is_team = "team.json" in archive.namelist()
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{file!r} is not the zip of a model or of a team, or it is damaged: {error}.") from error
-    if is_team:
-        saved = read_team(file)
+    with open(file, "rb") as opened:
+        names = names_in(opened, repr(file))
+        opened.seek(0)
+        content = b"" if "team.json" in names else opened.read()
+    if "team.json" in names:
+        saved = read_team(file, trust)
         if agent not in saved.models:
             raise ValueError(
                 f"{file!r} is a team of {list(saved.models)}, without {agent!r}: name one of them, e.g."
-                f" '{file}:{next(iter(saved.models))}'."
+                f" '{file}:{next(iter(saved.models), 'agent')}'."
             )
-        model = saved.algo_class(agent).load(io.BytesIO(saved.models[agent]), device="cpu")
-        return model, saved.statistics.get(agent)
+        return saved.load_model(agent, device="cpu"), saved.statistics.get(agent)
+    name = class_of(content, file)
+    if name is not None:
+        return load_algorithm(find_algorithm(name, file, trust), content, file, trust, None, device="cpu"), None
+    # Raises an error that says what it would mean to trust the file
+    plain_objects(content, file, trust, {})
     data, _, _ = load_from_zip_file(file, device="cpu")
     policy_class = (data or {}).get("policy_class")
     for base in getattr(policy_class, "__mro__", ()):
         for reader in _READERS:
             if base in reader.policy_aliases.values():
-                return reader.load(file, device="cpu"), None
+                return load_algorithm(reader, content, file, trust, None, device="cpu"), None
     known = ", ".join(reader.__name__ for reader in _READERS)
     raise ValueError(
         f"{file!r} holds a model with the policy {policy_class}, from which its algorithm cannot be told: pass the model"
@@ -213,11 +223,16 @@ def _is_team(file: pathlib.Path) -> bool:
     return not zipfile.is_zipfile(path) or "team.json" in zipfile.ZipFile(path).namelist()
 
 
-def _statistics(name: str, given: Any, observation_space: spaces.Space) -> VecNormalize | None:
+def _statistics(name: str, given: Any, observation_space: spaces.Space, trust: Trust) -> VecNormalize | None:
     """Return the statistics that a partner is given explicitly: those of a file, a ``VecNormalize``, or None for none."""
     statistics = given
     if isinstance(given, (str, os.PathLike)):
         with open(given, "rb") as file:
+            if not trust.trust_pickle:
+                raise ValueError(
+                    f"The statistics of the partner {name!r}, {os.fspath(given)!r}, have to be unpickled, and {PICKLE}. If you"
+                    " trust that person: trust_pickle=True, or load them yourself by VecNormalize.load()."
+                )
             try:
                 statistics = pickle.load(file)
             except (pickle.UnpicklingError, EOFError):
