@@ -1,13 +1,13 @@
 """The command ``sb3-belief export``: one agent of a team as a file that runs without this package."""
 
-import json
-import zipfile
 from pathlib import Path
 
 import torch as th
 
+from sb3_belief.common.safe_files.archive import names_in
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.export import FORMATS, export_model
+from sb3_belief.team.checkpoint import read_team
 from sb3_belief.team.fixed_partners.partners import load_model
 from sb3_belief.zoo.errors import ConfigError, cause, suggestion
 from sb3_belief.zoo.preflight import check_output
@@ -36,14 +36,15 @@ def export(
         check_output(output, "--output")
     team, agent = _split(given)
     path = find_team(team, "export")
-    agents = _agents_of(path)
+    trusted = Trust.of(trust, extra_packages)
+    agents = _agents_of(path, trusted)
     if agents is None and agent is not None:
         raise ConfigError(f"export: {str(path)!r} is the zip of a single agent, so it has no {agent!r}. Leave out ':{agent}'.")
     if agents is not None and agent not in agents:
         unknown = "name" if agent is None else f"{str(path)!r} has no agent {agent!r}.{suggestion(agent, agents)} Name"
         raise ConfigError(f"export: {unknown} the agent: {team}:agent, one of {agents}.")
     try:
-        model, statistics = load_model(path, agent or "", Trust.of(trust, extra_packages))
+        model, statistics = load_model(path, agent or "", trusted)
         written = Path(output or folder_name(agent or path.stem) + FORMATS[file_format])
         graph = export_model(model, written, file_format, statistics)
     # A damaged file makes zipfile, pickle and torch raise whatever they raise, when it is read or when it is traced
@@ -69,14 +70,15 @@ def _split(given: str) -> tuple[str, str | None]:
     return team, agent
 
 
-def _agents_of(path: Path) -> list[str] | None:
+def _agents_of(path: Path, trust: Trust) -> list[str] | None:
     """Return the agents of a saved team, or None for another zip."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            return [*json.loads(archive.read("team.json"))["agents"]] if "team.json" in archive.namelist() else None
-    # A damaged file makes zipfile, zlib and json raise whatever they raise
+        with open(path, "rb") as file:
+            names = names_in(file, str(path))
+        return list(read_team(path, trust).models) if "team.json" in names else None
+    # A file of an earlier version that is trusted makes pickle raise whatever it raises
     except Exception as error:
-        raise ConfigError(f"export: {str(path)!r} is no saved team, or damaged ({cause(error)})") from error
+        raise ConfigError(f"export: {cause(error)}") from error
 
 
 def _shown(tensor: th.Tensor) -> str:

@@ -102,7 +102,12 @@ def test_all_arguments_are_saved(tmp_path, algorithm):
     schedules: dict[str, Any] = dict(action_coef=LinearSchedule(0.5, 0.1, 1.0), kl_coef=lambda remaining: 0.01 * remaining)
     model = make_model(algorithm=algorithm, policy_kwargs=widths, **ARGUMENTS, **schedules).learn(ROLLOUT)
     model.save(tmp_path / "agent")
-    loaded = algorithm.load(tmp_path / "agent", env=model.get_env(), device="cpu")
+    # A function without a name remains a pickle
+    with pytest.raises(ValueError, match=r"agent: its entry 'kl_coef' is there as a pickle only .*trust_pickle=True"):
+        algorithm.load(tmp_path / "agent", device="cpu")
+    replaced: Any = algorithm.load(tmp_path / "agent", device="cpu", custom_objects={"kl_coef": 0.25})
+    assert replaced.kl_coef(1.0) == 0.25 and replaced.action_coef(0.0) == pytest.approx(0.1)
+    loaded = algorithm.load(tmp_path / "agent", env=model.get_env(), device="cpu", trust_pickle=True)
     for name, value in ARGUMENTS.items():
         assert getattr(loaded, name) == value == getattr(loaded.policy.options, name)
     assert loaded.policy_kwargs == widths and loaded.rollout_buffer_kwargs == {}
@@ -111,7 +116,7 @@ def test_all_arguments_are_saved(tmp_path, algorithm):
         assert loaded.kl_coef(remaining) == pytest.approx(0.01 * remaining)
     # Loaded once more, from what the loaded one saves
     loaded.learn(ROLLOUT).save(tmp_path / "again")
-    assert same_parameters(loaded, algorithm.load(tmp_path / "again", device="cpu"))
+    assert same_parameters(loaded, algorithm.load(tmp_path / "again", device="cpu", trust_pickle=True))
 
 
 def test_arguments_can_be_changed_when_loading(tmp_path):

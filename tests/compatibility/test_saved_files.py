@@ -1,4 +1,8 @@
-"""Files of earlier versions load, predict what they predicted, and go on learning."""
+"""
+Files of earlier versions load, predict what they predicted, and go on learning.
+
+They are pickles, and so load only if they are trusted.
+"""
 
 import json
 import shutil
@@ -6,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch as th
 
 from sb3_belief import MaskableBeliefPPO, Team, make_team_env
@@ -31,7 +36,9 @@ def weights(model) -> th.Tensor:
 
 def test_a_team_loads_predicts_the_same_and_goes_on_learning():
     env = make_team_env(ENV_ID, n_envs=2, seed=1)
-    team = Team.load(DATA / "team.zip", env=env)
+    with pytest.raises(ValueError, match=r"team.zip is of an earlier version .* a pickle can run any code"):
+        Team.load(DATA / "team.zip", env=env)
+    team = Team.load(DATA / "team.zip", env=env, trust_pickle=True)
     assert team.num_timesteps == 64 and team.normalize is True
     model: Any
     for agent, model in team.agents.items():
@@ -48,7 +55,9 @@ def test_a_team_loads_predicts_the_same_and_goes_on_learning():
 
 
 def test_an_agent_loads_without_the_others():
-    model = MaskableBeliefPPO.load(DATA / "agent.zip")
+    with pytest.raises(ValueError, match=r"agent.zip has been written by .* an earlier version .* a pickle can run any code"):
+        MaskableBeliefPPO.load(DATA / "agent.zip")
+    model = MaskableBeliefPPO.load(DATA / "agent.zip", trust_pickle=True)
     assert_same(outputs(model), EXPECTED["agent"]["car_1"])
     assert model.num_timesteps == 64
 
@@ -57,9 +66,10 @@ def test_a_run_folder_is_gone_on_with(tmp_path):
     folder = shutil.copytree(DATA / "results", tmp_path / "results")
     first, second = (folder / "belief_ppo" / f"{RUN_ENV_ID}_{number}" for number in (1, 2))
     resumed = ["train", "--env", RUN_ENV_ID, "-i", str(first), "-n", "64", "-f", str(folder), "--eval-freq", "-1"]
-    assert command(resumed) == 0
+    assert command(resumed) == 2 and not second.exists()
+    assert command([*resumed, "--trust"]) == 0
     assert json.loads((second / "run.json").read_text())["status"] == "finished"
-    before, after = Team.load(first / "team.zip"), Team.load(second / "team.zip")
+    before, after = Team.load(first / "team.zip", trust_pickle=True), Team.load(second / "team.zip")
     assert (before.num_timesteps, after.num_timesteps) == (64, 128)
     assert not th.equal(weights(before.agents["follower"]), weights(after.agents["follower"]))
-    assert Team.load(first / "best_model.zip").possible_agents == ["follower"]
+    assert Team.load(first / "best_model.zip", trust_pickle=True).possible_agents == ["follower"]

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_belief import BeliefPPO
 from sb3_belief.belief import filled_rows
+from tests.archives import changed_json, rewrite
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ToyEnv
 
@@ -125,7 +126,7 @@ def test_open_files_and_classes():
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         manifest = json.loads(archive.read("team.json"))
-    assert manifest["format"] == 1 and manifest["agents"] == ["agent_0", "agent_1"]
+    assert manifest["format"] == 2 and manifest["agents"] == ["agent_0", "agent_1"]
     assert manifest["classes"] == {"agent_0": "stable_baselines3.a2c.a2c:A2C", "agent_1": "stable_baselines3.dqn.dqn:DQN"}
     assert manifest["versions"]["stable-baselines3"] and manifest["versions"]["sb3-belief"]
     loaded = Team.load(file, env=make_team_env(ToyEnv))
@@ -148,32 +149,30 @@ def test_an_environment_that_does_not_fit(tmp_path):
         Team.load(tmp_path / "team", env=ToyEnv())
 
 
-def rewrite(path, change):
-    """Rewrite a saved team's file with a changed manifest."""
-    with zipfile.ZipFile(path) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    manifest = json.loads(parts["team.json"])
-    change(manifest)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, part in parts.items():
-            archive.writestr(name, json.dumps(manifest) if name == "team.json" else part)
-
-
 @pytest.mark.parametrize(
     "change, says",
     [
-        ({"format": 99}, "team format 99; this version reads 1"),
-        ({"agents": ["agent_0", "agent_1", "agent_9"]}, "damaged.*agent_9"),
+        ({"format": 99}, "team format 99; this version reads 2"),
+        ({"agents": ["agent_0", "agent_1", "agent_9"]}, "entry 'classes' does not say what each of the agents has"),
+        ({"agents": "agent_0"}, "entry 'agents' is not as it was written"),
+        ({"seed": "x"}, "entry 'seed' is not as it was written"),
         (
             {"classes": {"agent_0": "no.such.module:Class", "agent_1": "os:path"}},
-            "no.such.module:Class, which cannot be imported",
+            "'agent_0' is a no.such.module:Class, but .* is of a package that is not allowed",
         ),
-        ({"classes": {"agent_0": "os:path", "agent_1": "os:path"}}, "not an SB3 algorithm"),
+        (
+            {"classes": {"agent_0": "sb3_belief.nowhere:Class", "agent_1": "os:path"}},
+            "'agent_0' is a sb3_belief.nowhere:Class, but .* cannot be imported here",
+        ),
+        (
+            {"classes": dict.fromkeys(("agent_0", "agent_1"), "torch.nn.modules.linear:Linear")},
+            "is a torch.nn.modules.linear:Linear, which is not an SB3 algorithm",
+        ),
     ],
 )
 def test_manifests_that_are_wrong(tmp_path, change, says):
     trained().save(tmp_path / "team.zip")
-    rewrite(tmp_path / "team.zip", lambda manifest: manifest.update(change))
+    rewrite(tmp_path / "team.zip", "team.json", changed_json(**change))
     with pytest.raises(ValueError, match=says):
         Team.load(tmp_path / "team.zip")
 

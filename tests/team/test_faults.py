@@ -42,7 +42,7 @@ def works_again(team, tmp_path):
     team.learn(32)
     assert team.num_timesteps == 32
     assert all(not th.equal(before[agent], parameters(model)) for agent, model in team.agents.items())
-    loaded = Team.load(tmp_path / "after")
+    loaded = Team.load(tmp_path / "after", allow_packages=["tests"])
     assert all(th.equal(before[agent], parameters(model)) for agent, model in loaded.agents.items())
 
 

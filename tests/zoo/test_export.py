@@ -1,12 +1,7 @@
 """The command ``sb3-belief export``."""
 
-import base64
-import json
-import os
-import pickle
-import tempfile
+import shutil
 import zipfile
-from pathlib import Path
 
 import onnxruntime
 import pytest
@@ -14,6 +9,7 @@ import torch as th
 
 from sb3_belief import BeliefPPO, Team, make_team_env
 from sb3_belief.zoo.cli import main
+from tests.archives import archive_of, changed, changed_json, evil_data, members_of, rewrite
 
 
 @pytest.fixture(scope="module")
@@ -28,32 +24,21 @@ def run(tmp_path_factory):
     return folder
 
 
-class Evil:
-    """What a stranger's pickle may hold: a call of anything."""
-
-    def __reduce__(self):
-        return os.mkdir, ("made_by_code",)
-
-
 @pytest.fixture(scope="module")
 def evil(run, tmp_path_factory):
     """The same run and agent from a stranger, with code of the stranger's in them."""
     folder = tmp_path_factory.mktemp("evil")
-    rewrite(run / "agents" / "car_1.zip", folder / "car_1.zip", "data", with_code)
-    agent = (folder / "car_1.zip").read_bytes()
-    rewrite(run / "team.zip", folder / "team.zip", "agents/car_1.zip", lambda _: agent)
+    shutil.copytree(run, folder, dirs_exist_ok=True)
+
+    def as_of_sb3(content):
+        """Leave out what this package writes besides, and put code into what SB3 does."""
+        members = members_of(changed("data", evil_data("lr_schedule", "made_by_code"))(content))
+        return archive_of({name: each for name, each in members.items() if name == "data" or name.endswith(".pth")})
+
+    agent = as_of_sb3((run / "agents" / "car_1.zip").read_bytes())
+    (folder / "car_1.zip").write_bytes(agent)
+    rewrite(folder / "team.zip", "agents/car_1.zip", lambda _: agent)
     return folder
-
-
-def with_code(data):
-    pickled = base64.b64encode(pickle.dumps(Evil())).decode()
-    return json.dumps({**json.loads(data), "lr_schedule": {":type:": "x", ":serialized:": pickled}}).encode()
-
-
-def rewrite(path, target, name, change):
-    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(target, "w") as changed:
-        for each in archive.namelist():
-            changed.writestr(each, change(archive.read(each)) if each == name else archive.read(each))
 
 
 def test_an_agent_is_written_where_one_is(run, tmp_path, monkeypatch, capsys):
@@ -90,8 +75,8 @@ def test_a_single_agents_zip_will_do(run, tmp_path):
         ("nowhere:car_1", [], "no file or folder 'nowhere:car_1'"),
         ("{run}:car_1", ["--output", "car.pt2"], "end it in .onnx"),
         ("{run}:car_1", ["--output", "/proc/car.onnx"], "--output: cannot write the file"),
-        ("{evil}:car_1", [], "'car_1' needs 'posix.mkdir', which could run any code"),
-        ("{evil}/car_1.zip", [], "'car_1' needs 'posix.mkdir', which could run any code"),
+        ("{evil}:car_1", [], "agent 'car_1' has been written by Stable-Baselines3 alone"),
+        ("{evil}/car_1.zip", [], "a pickle can run any code of whoever made the file"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(run, evil, tmp_path, monkeypatch, capsys, given, options, message):
@@ -100,18 +85,7 @@ def test_what_cannot_be_exported_is_refused(run, evil, tmp_path, monkeypatch, ca
     assert message.format(run=run) in capsys.readouterr().err and list(tmp_path.iterdir()) == []
 
 
-def changed_data(**changes):
-    return lambda data: json.dumps({**json.loads(data), **changes}).encode()
-
-
-def changed_model(change, name="data"):
-    def changed(content):
-        with tempfile.TemporaryDirectory() as folder:
-            Path(folder, "a.zip").write_bytes(content)
-            rewrite(Path(folder, "a.zip"), Path(folder, "b.zip"), name, change)
-            return Path(folder, "b.zip").read_bytes()
-
-    return changed
+AGENT, STATISTICS = "agents/car_1.zip", "agents/car_1.vecnormalize.json"
 
 
 @pytest.mark.parametrize(
@@ -119,30 +93,32 @@ def changed_model(change, name="data"):
     [
         ("team.json", lambda _: b"[1]"),
         ("team.json", lambda data: data[:40]),
-        ("team.json", changed_data(agents=3)),
-        ("team.json", changed_data(classes=["x"])),
-        ("team.json", changed_data(classes={"car_1": "torch.nn:Linear"})),
-        ("agents/car_1.zip", lambda data: data[:99]),
-        ("agents/car_1.zip", changed_model(lambda _: b"[1]")),
-        ("agents/car_1.zip", changed_model(lambda _: b"{}")),
-        ("agents/car_1.zip", changed_model(changed_data(observation_space=None))),
-        ("agents/car_1.zip", changed_model(changed_data(policy_kwargs=[1]))),
-        ("agents/car_1.zip", changed_model(changed_data(policy_kwargs={"net_arch": "x"}))),
-        ("agents/car_1.zip", changed_model(changed_data(history_length="x"))),
-        ("agents/car_1.zip", changed_model(changed_data(policy_class={":type:": "x", ":serialized:": "gAR9lC4="}))),
-        ("agents/car_1.zip", changed_model(lambda data: data[:99], "policy.pth")),
-        ("agents/car_1.vecnormalize.pkl", lambda data: data[:99]),
-        ("agents/car_1.vecnormalize.pkl", lambda _: pickle.dumps(3)),
+        ("team.json", changed_json(agents=3)),
+        ("team.json", changed_json(classes=["x"])),
+        ("team.json", changed_json(classes={"car_1": "torch.nn:Linear"})),
+        (AGENT, lambda data: data[:99]),
+        (AGENT, changed("data", lambda _: b"[1]")),
+        (AGENT, changed("data", lambda _: b"{}")),
+        (AGENT, changed("data", changed_json(policy_kwargs=[1]))),
+        (AGENT, changed("data", changed_json(policy_kwargs={"net_arch": "x"}))),
+        (AGENT, changed("data", changed_json(history_length="x"))),
+        (AGENT, changed("policy.pth", lambda data: data[:99])),
+        (AGENT, changed("sb3_belief.json", lambda data: data[:99])),
+        (AGENT, changed("sb3_belief.json", changed_json(entries={}))),
+        (AGENT, changed("sb3_belief.json", changed_json(entries={"policy_class": {"tree": 1, "size": 0}}))),
+        (STATISTICS, lambda data: data[:99]),
+        (STATISTICS, lambda _: b"3"),
     ],
 )
 def test_a_damaged_file_is_refused_by_its_name(run, tmp_path, monkeypatch, capsys, name, change):
     team = tmp_path / "team.zip"
-    rewrite(run / "team.zip", team, name, change)
     monkeypatch.chdir(tmp_path)
-    # Also without the look at the file that trust leaves out
-    for trust in ([], ["--trust"]):
-        assert main(["export", f"{team}:car_1", *trust]) == 2
+    # As damaged on its way, and as written so by someone
+    for signed in (False, True):
+        shutil.copy(run / "team.zip", team)
+        rewrite(team, name, change, signed)
+        assert main(["export", f"{team}:car_1"]) == 2
         said = capsys.readouterr().err
         assert said.startswith("Refused: export: ") and str(team) in said and said.count("\n") == 1
-        assert "team.json" in name or "car_1" in said
+        assert name.removesuffix("zip").removesuffix("json") in said or "car_1" in said
     assert list(tmp_path.iterdir()) == [team]

@@ -15,6 +15,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from tests.archives import members_of
 from tests.team.fixed_partners.helpers import AgentEnv, one, toy, zero
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MaskedEnv, PartneredEnv, ToyEnv
@@ -92,24 +93,34 @@ def test_zips_of_single_models(tmp_path, algo):
     team = Team(algo, "BeliefPolicy" if algo is BeliefPPO else "MlpPolicy", env, seed=1, **kwargs)
     model = team.agents["agent_1"]
     model.save(tmp_path / "model.zip")
+    # What SB3 alone has written has to be unpickled
+    trust = algo is not BeliefPPO
+    if trust:
+        with pytest.raises(ValueError, match="a pickle can run any code of whoever made the file"):
+            AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "model.zip"})
     expected = others_did(AgentEnv(toy(2), "agent_0", {"agent_1": model}, deterministic=True))
     for path in ("model.zip", "model"):
-        env = AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / path}, deterministic=True)
+        env = AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / path}, deterministic=True, trust_pickle=trust)
         assert np.array_equal(others_did(env), expected)
+    # Its zip within the team's has a class and no need of trust
+    team.save(tmp_path / "team.zip")
+    (tmp_path / "alone.zip").write_bytes(members_of((tmp_path / "team.zip").read_bytes())["agents/agent_1.zip"])
+    env = AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "alone.zip"}, deterministic=True)
+    assert np.array_equal(others_did(env), expected)
 
 
 def test_files_that_hold_no_partner(tmp_path):
     (tmp_path / "text.zip").write_text("nothing")
-    with pytest.raises(ValueError, match="is not the zip of a model or of a team"):
+    with pytest.raises(ValueError, match="is not a zip, or it is damaged"):
         AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "text.zip"})
     model = PPO("MlpPolicy", gym.make("CartPole-v1"), **PPO_KWARGS)
     model.save(tmp_path / "cartpole.zip")
     with pytest.raises(ValueError, match=r"'agent_1' has been made for the observation space .* but 'agent_1' has"):
-        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "cartpole.zip"})
+        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "cartpole.zip"}, trust_pickle=True)
     with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
         archive.writestr("data", "{}")
     with pytest.raises(ValueError, match="algorithm cannot be told: pass the model itself"):
-        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "empty.zip"})
+        AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "empty.zip"}, trust_pickle=True)
 
 
 def test_partners_with_a_state_are_told_of_episodes():
