@@ -312,7 +312,7 @@ class Team(SB3Protocol):
         **kwargs: Any,
     ) -> SelfTeam:
         """
-        Load a saved team, running nothing of whoever made it. Random numbers start anew from its seed, unless ``exact`` is set.
+        Load a saved team, running nothing of whoever made it. Random numbers start anew from its seed, unless ``exact``.
 
         :param path: Path of a saved team, with or without ".zip", or an open binary file
         :param env: Environment to learn in, whose number of copies may differ; None for a team that can only predict
@@ -339,8 +339,7 @@ class Team(SB3Protocol):
         check_jobs(jobs)
         if exact:
             check_exact_load(env, {**kwargs, **(agent_kwargs or {})})
-        saved = read_team(path)
-@@        saved = read_team(path, Trust.of(trust_pickle, allow_packages))
+        saved = read_team(path, Trust.of(trust_pickle, allow_packages))
         loop = None if env is None else JointLoop(check_team_vec_env(env))
         if loop is not None:
             saved.check_env(loop.env, loop.possible_agents, loop.scripted)
