@@ -16,8 +16,6 @@ import torch as th
 from sb3_belief.common.plain_data import kinds
 from sb3_belief.common.plain_data.kinds import ATOMS, Misfit, PlainData
 
-#: More than this many objects, besides numbers and texts, are not read
-MOST_NODES = 20_000_000
 # What numpy's C code takes as it is and would read beyond the state with
 _POSITIONS = {"MT19937": ("state", "pos", 624), "Philox": (None, "buffer_pos", 4)}
 
@@ -80,7 +78,7 @@ class _Decoder:
             raise Misfit(f"a {kind} must have {sorted(fields)}, not {sorted(map(str, data))}"[:300])
         self._depth += 1
         self._n_nodes += 1
-        if self._depth > kinds.DEEPEST or self._n_nodes > MOST_NODES:
+        if self._depth > kinds.DEEPEST or self._n_nodes > kinds.MOST_NODES:
             raise Misfit("it is nested too deeply, or has too many parts")
         try:
             value = read(self, data)
@@ -113,8 +111,6 @@ class _Decoder:
         if kind is not None and type(value) is not kind:
             raise Misfit(f"it refers to {number}, which is another kind")
         return value
-
-    # -- checks --------------------------------------------------------------------------------------------------------
 
     def _int(self, value: Any, least: int = 0) -> int:
         if type(value) is not int or value < least:
@@ -205,8 +201,6 @@ class _Decoder:
     def _range(self, data: dict[str, Any]) -> Any:
         return {"range": range, "slice": slice}[data["is"]](*self._tuple(data))
 
-    # -- values --------------------------------------------------------------------------------------------------------
-
     def _ref(self, data: dict[str, Any]) -> Any:
         return self._known(data.get("to"))
 
@@ -283,8 +277,6 @@ class _Decoder:
 
     def _device(self, data: dict[str, Any]) -> th.device:
         return th.device(self._a(str, data["name"]))
-
-    # -- random numbers ------------------------------------------------------------------------------------------------
 
     def _generator(self, data: dict[str, Any]) -> np.random.Generator:
         return np.random.Generator(self._of(np.random.BitGenerator, data["bits"], "bit_generator"))

@@ -19,6 +19,8 @@ Accepts = Callable[[Any], bool]
 
 #: Nested deeper than this nothing is written or read, far from Python's own limit
 DEEPEST = 120
+#: More than this many objects, besides numbers and texts, are not read
+MOST_NODES = 20_000_000
 #: Kinds of values that are the same in JSON
 ATOMS = frozenset({type(None), bool, int, str, float})
 #: Python's integers beyond this have digits that take long to read, and are written in hexadecimal

@@ -30,7 +30,15 @@ PACKAGES = ("stable_baselines3", "sb3_contrib", "sb3_belief", "torch", "numpy", 
 # Parts of a model that its zip or its team saves, and constants
 _NO_STATE = (nn.Module, th.optim.Optimizer, spaces.Space, BaseBuffer, Logger, VecEnv, th.device, str, type)
 # Of a learn() that has begun, not of the model
-_OF_LEARN = {"start_time", "_total_timesteps", "_num_timesteps_at_start", "_custom_logger", "_logger", "env", "_vec_normalize_env"}
+_OF_LEARN = {
+    "start_time",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_custom_logger",
+    "_logger",
+    "env",
+    "_vec_normalize_env",
+}
 # What reset() makes anew in a rollout buffer, besides its arrays
 _OF_ROLLOUT = {"pos", "full", "generator_ready"}
 _NOISE_MATRICES = ("exploration_mat", "exploration_matrices")
@@ -213,6 +221,9 @@ def _put_into(owner: Any, values: Mapping[str, Any]) -> None:
         present = own.get(name)
         if isinstance(present, th.Tensor) and isinstance(value, th.Tensor) and present.shape == value.shape:
             present.copy_(value)
+        elif isinstance(present, ActionNoise) and type(present) is type(value):
+            # SB3 has taken it into a local variable before the rollout began
+            vars(present).update(vars(value))
         else:
             own[name] = value
 

@@ -89,7 +89,8 @@ def wrapper_states(env: VecEnv) -> list[dict[str, Any]]:
     :return: Of each wrapper, the outermost first
     """
     return [
-        {name: value for name, value in vars(wrapper).items() if _is_counted(wrapper, name, value)} for wrapper in _wrappers(env)
+        {name: value for name, value in vars(wrapper).items() if _is_counted(wrapper, name, value)}
+        for wrapper in _wrappers(env)
     ]
 
 

@@ -131,7 +131,9 @@ class ExactTraining:
                     "The state of the environment cannot be saved, so that all its copies begin new episodes with each exact"
                     f" checkpoint, seeded by the team's seed and the step. {error}"
                 )
-        seed = int(np.random.SeedSequence(self._team.seed or 0, spawn_key=(0, 2, self._team.num_timesteps)).generate_state(1)[0])
+        seed = int(
+            np.random.SeedSequence(self._team.seed or 0, spawn_key=(0, 2, self._team.num_timesteps)).generate_state(1)[0]
+        )
         loop.env.seed(seed >> 2)
         loop.reset()
         for model in models.values():
