@@ -1,11 +1,36 @@
-"""Starting worker processes and receiving from them, for environment copies and for learning agents alike."""
+"""Starting, ending and hearing from worker processes, for environment copies and for learning agents alike."""
 
+import atexit
 import multiprocessing
+import multiprocessing.connection
+import os
 import select
 import signal
-from collections.abc import Callable
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any
+
+if sys.platform != "win32":
+    import fcntl
+
+#: Seconds that a worker gets to finish what it is at before it is killed, and how many times what it took at most so far
+PATIENCE, PATIENCE_FACTOR = 3.0, 3.0
+# Signals that ask a process to end. The main process decides what they mean for its workers
+_END_SIGNALS = ("SIGTERM", "SIGHUP")
+_started: "weakref.WeakSet[Any]" = weakref.WeakSet()
+
+
+class WorkerError(RuntimeError):
+    """A worker process has died, or has been ended because it did not answer."""
+
+
+class WorkerTimeoutError(WorkerError, TimeoutError):
+    """A worker process did not answer in time, and has been ended."""
 
 
 def start_context() -> Any:
@@ -34,13 +59,133 @@ def check_may_have_workers(what: str, instead: str) -> None:
         )
 
 
-def leave_interrupts_to_main() -> None:
+def start_worker(target: Callable[..., None], args: tuple[Any, ...], name: str | None = None) -> Any:
     """
-    Ignore Ctrl-C in the calling worker process.
+    Start a worker, which is killed at the latest when this process ends.
 
-    The terminal sends the signal to all processes of the group, but the main process decides when its workers end.
+    :param target: What it runs; it begins with :func:`become_worker`
+    :param args: Arguments of ``target``
+    :param name: Name of the process
+    :return: The ``multiprocessing`` process
+    """
+    process = start_context().Process(target=target, args=args, name=name, daemon=True)
+    process.start()
+    _started.add(process)
+    return process
+
+
+def become_worker() -> None:
+    """
+    Make the calling process a worker: it leaves signals to its parent, and ends with it.
+
+    A terminal or a scheduler sends signals to all processes of a group or a job, but the parent decides when its workers end:
+    it closes their pipe, or kills them. A worker leads a process group of its own, so that what it has started is killed with
+    it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in _END_SIGNALS:
+        if hasattr(signal, name):
+            number = getattr(signal, name)
+            # Not SIG_IGN: processes that the worker starts would inherit that, and could not be ended by the signal either
+            signal.signal(number, lambda *_: None)
+            if hasattr(signal, "siginterrupt"):
+                signal.siginterrupt(number, False)
+    if hasattr(os, "setpgrp"):
+        os.setpgrp()
+    _end_with_parent()
+
+
+def _end_with_parent() -> None:
+    """Have this process and its group killed when its parent has ended, however that ended."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+    # Of a pipe whose other end the parent holds. Its operating system parent may be another process, the fork server
+    sentinel = parent.sentinel
+    threading.Thread(target=_end_after, args=(sentinel,), name="ends-with-parent", daemon=True).start()
+    if hasattr(os, "setpgrp") and hasattr(os, "O_ASYNC") and hasattr(fcntl, "F_SETSIG"):
+        # The thread needs Python's lock, which code that hangs may hold. On Linux the kernel itself can watch the pipe
+        with suppress(OSError):
+            fcntl.fcntl(sentinel, fcntl.F_SETOWN, -os.getpgrp())
+            fcntl.fcntl(sentinel, fcntl.F_SETSIG, signal.SIGKILL)
+            fcntl.fcntl(sentinel, fcntl.F_SETFL, fcntl.fcntl(sentinel, fcntl.F_GETFL) | os.O_ASYNC)
+
+
+def _end_after(sentinel: int) -> None:
+    multiprocessing.connection.wait([sentinel])
+    if hasattr(os, "killpg") and os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+def kill_workers(processes: Iterable[Any]) -> None:
+    """
+    Kill workers and what they have started, without a long wait whatever they do.
+
+    :param processes: As :func:`start_worker` returned them
+    """
+    processes = list(processes)
+    for process in processes:
+        # Not only of one that lives: what it has started may have outlived it
+        if hasattr(os, "killpg"):
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+    deadline = time.monotonic() + 2.0
+    for process in processes:
+        process.join(max(deadline - time.monotonic(), 0.0))
+        _started.discard(process)
+
+
+def join_workers(processes: Iterable[Any], seconds: float) -> None:
+    """
+    Wait for workers that have been told to end, and kill those that do not.
+
+    :param processes: As :func:`start_worker` returned them
+    :param seconds: How long to wait for all of them together
+    """
+    deadline = time.monotonic() + seconds
+    late = []
+    for process in processes:
+        process.join(max(deadline - time.monotonic(), 0.0))
+        if process.is_alive():
+            late.append(process)
+        else:
+            _started.discard(process)
+    kill_workers(late)
+
+
+def _kill_all(pid: int) -> None:
+    # A forked child has a copy of the set, but must not end its parent's workers
+    if os.getpid() == pid:
+        kill_workers(process for process in list(_started) if process.is_alive())
+
+
+# multiprocessing asks its processes to end when this one does, and waits for them without a limit. What is registered later
+# runs earlier
+atexit.register(_kill_all, os.getpid())
+
+
+def patience(longest: float) -> float:
+    """
+    Return how many seconds to wait for a worker that may be slow, or may hang.
+
+    :param longest: Seconds that it took at most for an answer so far
+    """
+    return max(PATIENCE, PATIENCE_FACTOR * longest)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C until the end of the block, on systems that can."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
 
 
 class Inbox:
@@ -61,16 +206,39 @@ class Inbox:
             poll.register(connection.fileno(), select.POLLIN)
             self._readable_within = lambda seconds: bool(poll.poll(1000 * seconds))
 
-    def wait(self) -> None:
+    def wait(self, deadline: float | None = None) -> bool:
         """
         Wait until there is a message to receive.
 
         The death of a worker does not always close its pipe, since another process, such as one that the worker has started,
         may hold a copy of it. A plain ``recv()`` could therefore wait for ever.
 
+        :param deadline: When to give up, by ``time.monotonic()``; None to wait without a limit
+        :return: Whether there is a message. False at the deadline
         :raises EOFError: If the worker is dead and all its messages have been received
         """
-        while not self._readable_within(1.0):
+        while not self._readable_within(1.0 if deadline is None else min(1.0, max(deadline - time.monotonic(), 0.0))):
             # The worker may have sent its last message after the first call and then died, hence the second call
-            if not self._process.is_alive() and not self._readable_within(0.0):
+            if is_dead(self._process) and not self._readable_within(0.0):
                 raise EOFError
+            if deadline is not None and time.monotonic() >= deadline:
+                return False
+        return True
+
+
+def is_dead(process: Any) -> bool:
+    """
+    Return whether a worker has ended.
+
+    :param process: As :func:`start_worker` returned it
+    """
+    if process.is_alive():
+        return False
+    if process.exitcode != 255 or os.name != "posix":
+        return True
+    # The fork server, which tells when its children end, may itself have been ended by a signal to the process group
+    try:
+        os.kill(process.pid, 0)
+    except OSError:
+        return True
+    return False

@@ -6,6 +6,7 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
+from sb3_belief.common.exceptions import add_note
 from sb3_belief.envs.registry import make_batched_env, spec
 from sb3_belief.vec_env.joint_env import JointEnv, Visibility
 from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
@@ -20,6 +21,8 @@ def make_team_env(
     env_kwargs: Mapping[str, Any] | None = None,
     wrapper: Callable[[ParallelEnv], ParallelEnv] | None = None,
     visibility: Visibility | None = None,
+    step_timeout: float | None = None,
+    restart_workers: int = 0,
 ) -> TeamVecEnv:
     """
     Make ``n_envs`` copies of a team environment as one SB3 ``VecEnv``.
@@ -37,22 +40,30 @@ def make_team_env(
     :param visibility: Which actions each agent could observe, for an environment that has no method ``visibility()``. The
         callable is given the ``ParallelEnv`` of each copy after each step and returns {agent: bool [n_others]}, the others in
         the order of ``possible_agents``. With None every agent sees the actions of all agents in play
+    :param step_timeout: Seconds within which a worker process must answer each reset, step or other command, beside its start.
+        One that does not is ended, and an error names copy, step and command. Longer than the slowest reset; None for no limit
+    :param restart_workers: How often each copy is made anew after its worker has died or hung, or its environment has raised
+        an error, in a step or reset. The episode is cut off there (``TimeLimit.truncated``, ``worker_restarted`` in the info),
+        with a warning. The new copy is seeded from the copy's seed and the number of its restarts; attributes that were set on
+        the old one are lost. Copies are then stepped one by one even if the environment has a batched class
     :return: The vectorised environment
     :raises TypeError: If ``env`` is an environment instead of a callable that makes one
-    :raises ValueError: For an unknown id, an unknown ``vec_env``, ``n_envs < 1``, or ``visibility`` for an environment that
-        has a method ``visibility()``
+    :raises ValueError: For an unknown id, an unknown ``vec_env``, ``n_envs < 1``, a ``step_timeout`` that is not positive or
+        without worker processes, a negative ``restart_workers``, or ``visibility`` for an environment that has a method
+        ``visibility()``
     :raises ModuleNotFoundError: If the package of an id is not installed. The message has the line that installs it
     """
     if vec_env not in ("dummy", "subproc"):
         raise ValueError(f"vec_env must be 'dummy' or 'subproc', got {vec_env!r}.")
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
+    check_fault_options(vec_env, step_timeout, restart_workers)
     kwargs = dict(env_kwargs or {})
 
     team_env: TeamVecEnv | None = None
     if isinstance(env, str):
         # A batched class has no ParallelEnv per copy to which a wrapper or a visibility function could be applied
-        if vec_env == "dummy" and wrapper is None and visibility is None:
+        if vec_env == "dummy" and wrapper is None and visibility is None and not restart_workers:
             team_env = make_batched_env(env, n_envs, **kwargs)
         # The id is looked up in this process, because ids registered here are unknown in a worker process
         make_one = spec(env).maker(**kwargs)
@@ -66,10 +77,32 @@ def make_team_env(
 
     if team_env is None:
         make_copies = [partial(_make_joint, make_one, wrapper, visibility, copy) for copy in range(n_envs)]
-        team_env = ParallelTeamVecEnv(make_copies, subproc=vec_env == "subproc")
+        team_env = ParallelTeamVecEnv(make_copies, vec_env == "subproc", step_timeout, restart_workers)
     if seed is not None:
         team_env.seed(seed)
     return team_env
+
+
+def check_fault_options(vec_env: str, step_timeout: float | None, restart_workers: int) -> None:
+    """
+    Check what is to be done about copies that fail.
+
+    :param vec_env: As for :func:`make_team_env`
+    :param step_timeout: As for :func:`make_team_env`
+    :param restart_workers: As for :func:`make_team_env`
+    :raises ValueError: If one is out of its range, or a time limit is given where nothing could be ended
+    """
+    if step_timeout is not None:
+        is_number = isinstance(step_timeout, (int, float)) and not isinstance(step_timeout, bool)
+        if not (is_number and 0 < step_timeout < float("inf")):
+            raise ValueError(f"step_timeout must be a positive number of seconds, or None for no limit, got {step_timeout!r}.")
+        if vec_env != "subproc":
+            raise ValueError(
+                f"step_timeout={step_timeout!r} needs vec_env='subproc': an environment in this process cannot be ended"
+                " while it hangs."
+            )
+    if not isinstance(restart_workers, int) or isinstance(restart_workers, bool) or restart_workers < 0:
+        raise ValueError(f"restart_workers must be a number of restarts, 0 for none, got {restart_workers!r}.")
 
 
 def _make_joint(
@@ -78,5 +111,9 @@ def _make_joint(
     visibility: Visibility | None,
     copy: int,
 ) -> JointEnv:
-    env = make_one()
-    return JointEnv(env if wrapper is None else wrapper(env), visibility, copy)
+    try:
+        env = make_one()
+        return JointEnv(env if wrapper is None else wrapper(env), visibility, copy)
+    except Exception as error:
+        add_note(error, f"Raised when environment copy {copy} was made.")
+        raise

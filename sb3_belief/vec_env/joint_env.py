@@ -1,6 +1,6 @@
 """A PettingZoo ``ParallelEnv`` as a single Gymnasium environment, so that SB3's own vectorisers can hold copies of it."""
 
-from collections.abc import Callable, KeysView, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from math import isfinite
 from typing import Any, TypeAlias
@@ -15,7 +15,7 @@ from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.action_masks import mask_row, mask_width
 from sb3_belief.vec_env.copy_state import CopyState
 from sb3_belief.vec_env.events import Events, Flags, StepRecord, find_events, no_flags
-from sb3_belief.vec_env.observation_forms import ObservationForms, copied, map_parts, zeros_in
+from sb3_belief.vec_env.observation_forms import ObservationForms, copied, has_parts, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
 from sb3_belief.vec_env.returned import (
     StepParts,
@@ -125,7 +125,7 @@ class JointEnv(gym.Env):
         try:
             result = self._game.reset(seed=seed, options=options)
         except Exception as error:
-            add_note(error, f"Raised by the environment's reset() {self._where}.")
+            self.name_place(error, "reset()")
             raise
         obs, infos = plain_reset(result, self._where)
         if self._forms is not None:
@@ -155,7 +155,7 @@ class JointEnv(gym.Env):
         try:
             result = self._game.step({agent: action[agent] for agent in before})
         except Exception as error:
-            add_note(error, f"Raised by the environment's step() {self._where}.")
+            self.name_place(error, "step()")
             raise
         if self._forms is not None:
             result = self._converted(result)
@@ -184,7 +184,7 @@ class JointEnv(gym.Env):
             if agent in obs and getattr(obs[agent], "shape", None) != shape:
                 self._check_observations(obs, [agent])
         for agent, keys, shapes in self._dict_shapes:
-            if agent in obs and not _has_parts(obs[agent], keys, shapes):
+            if agent in obs and not has_parts(obs[agent], keys, shapes):
                 self._check_observations(obs, [agent])
         team_reward = float(total / len(agents)) if self._team_reward is None else self._own_team_reward(rewards, total)
         # In nearly all steps of nearly all environments nothing happens to any agent, and the loop over agents is saved
@@ -281,7 +281,11 @@ class JointEnv(gym.Env):
 
     def render(self) -> Any:
         """Return what the environment's own ``render()`` returns."""
-        return self.env.render()
+        try:
+            return self.env.render()
+        except Exception as error:
+            self.name_place(error, "render()")
+            raise
 
     @property
     def agents_in_play(self) -> list[str]:
@@ -292,6 +296,15 @@ class JointEnv(gym.Env):
     def close(self) -> None:
         """Close the environment."""
         self._user_env.close()
+
+    def name_place(self, error: BaseException, what: str) -> None:
+        """
+        Add to an error of the environment where it was raised.
+
+        :param error: The error, as it is being handled
+        :param what: What raised it
+        """
+        add_note(error, f"Raised by the environment's {what} {self._where}.")
 
     def set_env_attr(self, name: str, value: Any) -> None:
         """
@@ -380,13 +393,6 @@ def step_and_reset(
         obs, reset_info = env.reset()
         masks = reset_info.get("action_masks")
     return obs, reward, done, record, masks, info
-
-
-def _has_parts(value: Any, keys: KeysView[str], shapes: list[tuple[str, tuple[int, ...]]]) -> bool:
-    """Return whether a dict has all its entries, as arrays of these shapes."""
-    if not (isinstance(value, Mapping) and value.keys() >= keys):
-        return False
-    return all(getattr(value[key], "shape", None) == shape for key, shape in shapes)
 
 
 def _as_array(zero: np.ndarray, value: Any) -> np.ndarray:

@@ -6,7 +6,7 @@ Environments also give tuples, nested dicts, and PettingZoo's ``{"observation": 
 """
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, KeysView, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -276,6 +276,19 @@ def as_bytes(observation: Any) -> Any:
     :return: Its bytes, or a dict of bytes
     """
     return map_parts(lambda part: np.asarray(part).tobytes(), observation)
+
+
+def has_parts(value: Any, keys: KeysView[str], shapes: list[tuple[str, tuple[int, ...]]]) -> bool:
+    """
+    Return whether a dict has all its entries, as arrays of these shapes.
+
+    :param value: What may be such a dict
+    :param keys: Names of the entries
+    :param shapes: Name and shape of those that have a shape
+    """
+    if not (isinstance(value, Mapping) and value.keys() >= keys):
+        return False
+    return all(getattr(value[key], "shape", None) == shape for key, shape in shapes)
 
 
 def row_of(observations: Any, env_idx: int) -> Any:

@@ -1,8 +1,10 @@
 """``TeamVecEnv`` over copies of a PettingZoo ``ParallelEnv``, in this process or in workers, held by SB3's own vectorisers."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -11,11 +13,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
-from sb3_belief.vec_env.action_masks import mask_parts, mask_width
+from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
-from sb3_belief.vec_env.observation_forms import parts_of
+from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
+from sb3_belief.vec_env.step_checks import StepChecks
 from sb3_belief.vec_env.team_vec_env import ObservationStack, TeamObs, TeamStep, TeamVecEnv
-from sb3_belief.vec_env.validation import check_spaces, n_choices, not_a_choice, not_finite, place
+from sb3_belief.vec_env.validation import check_spaces
 from sb3_belief.vec_env.workers import WorkersVecEnv
 
 
@@ -23,19 +26,28 @@ class ParallelTeamVecEnv(TeamVecEnv):
     """
     Copies of a team environment, each a ``JointEnv`` in SB3's ``DummyVecEnv`` or ``SubprocVecEnv``.
 
-    A worker process that dies ends the environment with a ``RuntimeError`` that says which one; the other workers are ended
-    too. Ctrl-C is left to the main process: workers ignore it, and an interrupted step is finished before the next one.
+    What an environment raises is raised here, with a note that names copy and step, and the environment can go on. A worker
+    process that dies or hangs ends it, with a ``WorkerError`` that says which one; the other workers are ended too. Ctrl-C is
+    left to the main process: workers ignore it, and an interrupted step is finished before the next one.
 
     :param env_fns: One callable for each copy, which makes its ``JointEnv``
     :param subproc: Whether each copy gets a worker process of its own, instead of being stepped in this one
+    :param step_timeout: Seconds within which a worker must answer, a start excepted; None for no limit
+    :param restart_workers: How often each copy is made anew after it has failed in a step or reset
     :raises ValueError: For names or spaces that a team cannot have, or that are not the same in all copies
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], JointEnv]], subproc: bool = False):
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], JointEnv]],
+        subproc: bool = False,
+        step_timeout: float | None = None,
+        restart_workers: int = 0,
+    ):
         self.venv: _InProcessVecEnv | WorkersVecEnv
         self._masks: np.ndarray | None = None
         if subproc:
-            self.venv = WorkersVecEnv(list(env_fns))
+            self.venv = WorkersVecEnv(env_fns, step_timeout, restart_workers)
         else:
             envs = [env_fn() for env_fn in env_fns]
             if len({id(env.env) for env in envs}) < len(envs):
@@ -43,7 +55,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
             # Before DummyVecEnv fails on them with a message of its own
             first = envs[0]
             check_spaces(first.possible_agents, first.observation_spaces, first.action_spaces, first.scripted_action_spaces)
-            self.venv = _InProcessVecEnv(envs)
+            self.venv = _InProcessVecEnv(envs, env_fns, restart_workers)
         try:
             agents, self._observation_spaces, self._action_spaces, scripted = self._common_members()
             super().__init__(
@@ -52,6 +64,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
         except BaseException:
             self.venv.close()
             raise
+        self.venv.steps_so_far = lambda: self._lengths
         if isinstance(self.venv, WorkersVecEnv):
             self.venv.set_members(self._observation_spaces, self._action_spaces, self.scripted_action_spaces)
         self.reports_success = any(self.venv.get_attr("reports_success"))
@@ -72,6 +85,11 @@ class ParallelTeamVecEnv(TeamVecEnv):
                     )
             members.append(first)
         return members
+
+    @property
+    def n_restarts(self) -> int:
+        """How often copies have been made anew after a fault."""
+        return sum(self.venv.restarts.counts)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
@@ -168,7 +186,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
             raise
         obs, _, dones, infos = step
         if self._checks.unable:
-            self._checks.check_unable(infos)
+            # A step that broke off tells nothing of who was in play in it
+            self._checks.check_unable([{} if "worker_restarted" in info else info for info in infos])
         self._checks.check_finite(obs, self.venv.agent_rewards, self._lengths)
         if self.venv.action_masks is not None:
             self._masks = self.venv.action_masks
@@ -182,18 +201,26 @@ class _InProcessVecEnv(DummyVecEnv):
 
     Observations are copied once, where they are stacked, and a ``JointEnv`` keeps nothing of its infos; further copies would
     take more time than all else that a joint step needs besides the environment.
+
+    :param envs: The copies
+    :param env_fns: One callable for each copy, which makes it anew
+    :param restart_workers: How often a copy may be made anew
     """
 
     # As in WorkersVecEnv
     agent_rewards: np.ndarray
     action_masks: np.ndarray | None = None
+    steps_so_far: Callable[[], Any]
 
-    def __init__(self, envs: list[JointEnv]):
+    def __init__(self, envs: list[JointEnv], env_fns: Sequence[Callable[[], JointEnv]] = (), restart_workers: int = 0):
         # SB3's constructor is not called, because it would make buffers, which agents with Dict observations cannot have
         first = envs[0]
-        self.envs, self.metadata = list[Any](envs), first.metadata
+        self.envs: list[Any] = list(envs)
+        self.metadata = first.metadata
         VecEnv.__init__(self, len(envs), first.observation_space, first.action_space)
         self._stack = ObservationStack(len(envs), first.observation_spaces)
+        self.restarts, self._env_fns = Restarts(len(envs), restart_workers), list(env_fns)
+        self._last = LastStep({})
 
     def reset(self) -> Any:
         """
@@ -201,14 +228,19 @@ class _InProcessVecEnv(DummyVecEnv):
 
         :return: Observations ``[num_envs, ...]`` by agent
         """
-        resets = [
-            env.reset(seed=seed, options=options or None)
-            for env, seed, options in zip(self.envs, self._seeds, self._options, strict=True)
-        ]
+        self.restarts.keep_seeds(self._seeds)
+        resets = []
+        for copy, (seed, options) in enumerate(zip(self._seeds, self._options, strict=True)):
+            try:
+                resets.append(self.envs[copy].reset(seed=seed, options=options or None))
+            except Exception as error:
+                resets.append(self._made_anew(copy, 0, error, options or None))
         self.reset_infos = [info for _, info in resets]
         self._reset_seeds()
         self._reset_options()
-        return self._stack([obs for obs, _ in resets])
+        stacked = self._stack([obs for obs, _ in resets])
+        self._last = LastStep(stacked)
+        return stacked
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -219,7 +251,12 @@ class _InProcessVecEnv(DummyVecEnv):
         """
         envs: list[Any] = self.envs
         actions: Any = self.actions
-        steps = [step_and_reset(env, action) for env, action in zip(envs, actions, strict=True)]
+        steps = []
+        for env, action in zip(envs, actions, strict=True):
+            try:
+                steps.append(step_and_reset(env, action))
+            except Exception as error:
+                steps.append(self._cut(len(steps), error))
         observations, rewards, dones, records, masks, others = zip(*steps, strict=True)
         self.agent_rewards = np.array([record.agent_rewards for record in records], dtype=np.float32)
         infos = []
@@ -238,177 +275,63 @@ class _InProcessVecEnv(DummyVecEnv):
                 info.update(other)
             infos.append(info)
         self.action_masks = None if masks[0] is None else np.array(masks)
-        return self._stack(observations), np.array(rewards, dtype=np.float32), np.array(dones), infos
+        stacked = self._stack(observations)
+        if self.restarts.limit:
+            self._last = LastStep(stacked, dones, [record.flags for record in records])
+        return stacked, np.array(rewards, dtype=np.float32), np.array(dones), infos
 
+    def _cut(self, copy: int, error: Exception) -> Any:
+        """Return the step of a copy that has raised an error in it."""
+        obs, info = self._made_anew(copy, int(self.steps_so_far()[copy]) + 1, error)
+        scripted = self.envs[copy].scripted_action_spaces
+        width = sum(map(spaces.flatdim, scripted.values()))
+        return cut_step(copy, self._last, len(scripted), width, obs, info.get("action_masks"))
 
-class StepChecks:
-    """
-    Checks of the joint steps of all copies at once.
+    def _made_anew(self, copy: int, step: int, cause: Exception, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Make a copy anew and reset it, or raise what has happened to it."""
+        while self.restarts.allow(copy):
+            seed = self.restarts.count(copy, step, cause)
+            try:
+                with suppress(Exception):
+                    self.envs[copy].close()
+                self.envs[copy] = self._env_fns[copy]()
+                return self.envs[copy].reset(seed=seed, options=options)
+            except Exception as error:
+                cause = error
+        raise cause
 
-    They first look for a sign that anything is wrong, which costs next to nothing, and only then for what it is.
-
-    :param agents: Names of the agents
-    :param observation_spaces: Observation space of each agent
-    :param action_spaces: Action space of each agent
-    """
-
-    def __init__(
-        self,
-        agents: Sequence[str],
-        observation_spaces: Mapping[str, spaces.Space],
-        action_spaces: Mapping[str, spaces.Space],
-    ):
-        self._agents, self._action_spaces = list(agents), action_spaces
-        self._floats = [
-            (agent, key)
-            for agent in agents
-            for key, part in parts_of(observation_spaces[agent]).items()
-            if np.issubdtype(part.dtype, np.floating)
-        ]
-        self._choices = [
-            (agent, key, part, n_choices(part))
-            for agent in agents
-            for key, part in parts_of(observation_spaces[agent]).items()
-            if n_choices(part) is not None
-        ]
-        self._bounds = {agent: _bounds(action_spaces[agent]) for agent in agents}
-        parts = [(i, size) for i, agent in enumerate(agents) for size in mask_parts(action_spaces[agent])]
-        # Whose each dimension of the masks is, and where it begins
-        self._mask_owners = [i for i, _ in parts]
-        self._mask_starts = np.cumsum([0, *(size for _, size in parts[:-1])])
-        #: Agents whose present mask allows no action, {(copy, number of the agent): step}
-        self.unable: dict[tuple[int, int], int] = {}
-
-    def check_discrete(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> list[int]:
+    def close(self) -> None:
         """
-        Check the actions of an agent with a ``Discrete`` action space.
+        Close all copies.
 
-        :param agent: Name of the agent
-        :param chosen: Its actions, ``[num_envs]``
-        :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        :return: The actions as plain integers
-        :raises ValueError: If one is not in its space
+        :raises BaseException: What the first of them raised that could not be closed, once all others are
         """
-        numbers = chosen.tolist()
-        if chosen.dtype.kind not in "iub" or min(numbers) < 0 or max(numbers) > self._bounds[agent][1]:
-            self._refuse_action(agent, chosen, steps)
-        return numbers
+        errors = []
+        for env in self.envs:
+            try:
+                env.close()
+            except Exception as error:
+                env.name_place(error, "close()")
+                errors.append(error)
+        for first in errors:
+            raise first
 
-    def check_vectors(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """
-        Check the actions of an agent with another action space.
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return self._of_each(f"attribute {attr_name!r}", partial(super().get_attr, attr_name), indices)
 
-        :param agent: Name of the agent
-        :param chosen: Its actions, ``[num_envs, ...]``
-        :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        :return: The actions
-        :raises ValueError: If one is not in its space
-        """
-        low, high = self._bounds[agent]
-        if not ((chosen >= low) & (chosen <= high)).all():
-            self._refuse_action(agent, chosen, steps)
-        return chosen
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        call = partial(super().env_method, method_name, *method_args, **method_kwargs)
+        return self._of_each(f"{method_name}()", lambda copy: call(indices=copy), indices)
 
-    def _refuse_action(self, agent: str, chosen: np.ndarray, steps: np.ndarray) -> NoReturn:
-        low, high = self._bounds[agent]
-        fits = ((chosen >= low) & (chosen <= high)).reshape(len(chosen), -1).all(axis=1)
-        # Where all values fit, it is their dtype that does not, and copy 0 serves as the example
-        copy = int(np.argmin(fits))
-        raise ValueError(
-            f"The action of {agent!r} {place(copy, int(steps[copy]) + 1)} is {chosen[copy].tolist()!r} (type {chosen.dtype}),"
-            f" which is not in its action space {self._action_spaces[agent]}. An SB3 model's own actions are; clip or convert"
-            " others."
-        )
-
-    def check_finite(self, obs: Mapping[str, Any], rewards: np.ndarray, steps: np.ndarray) -> None:
-        """
-        Check that observations and rewards are finite, and discrete observations in their spaces.
-
-        :param obs: Observations by agent, ``[num_envs, ...]``
-        :param rewards: Rewards of the agents, float32 ``[num_envs, n]``
-        :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        :raises ValueError: If a number is not finite, or an observation not in its space
-        """
-        for agent, key, space, n in self._choices:
-            values = obs[agent] if key is None else obs[agent][key]
-            fits = (values >= 0) & (values < n)
-            if not fits.all():
-                copy = int(np.argmin(fits.reshape(len(steps), -1).all(axis=1)))
-                where = place(copy, int(steps[copy]) + 1)
-                raise not_a_choice(_name(agent, key), values[copy], agent, space, where)
-        for agent, key in self._floats:
-            values = obs[agent] if key is None else obs[agent][key]
-            if not _all_finite(values):
-                copy = int(np.argmin(np.isfinite(values).reshape(len(steps), -1).all(axis=1)))
-                raise not_finite(_name(agent, key), values[copy], place(copy, int(steps[copy]) + 1))
-        if not _all_finite(rewards):
-            copy, i = (int(k) for k in np.argwhere(~np.isfinite(rewards))[0])
-            raise not_finite(f"reward of {self._agents[i]!r}", rewards[copy, i], place(copy, int(steps[copy]) + 1))
-
-    def check_masks(self, masks: np.ndarray, steps: np.ndarray) -> None:
-        """
-        Find masks that allow no action, and let these allow the first one, since a model must choose something.
-
-        :param masks: Masks of all agents side by side, bool ``[num_envs, width of all]``, changed in place
-        :param steps: How many steps each copy's episode has had, int ``[num_envs]``
-        """
-        self.unable = {}
-        if not self._mask_owners:
-            return
-        possible = np.logical_or.reduceat(masks, self._mask_starts, axis=1)
-        if not possible.all():
-            for copy, k in np.argwhere(~possible).tolist():
-                masks[copy, self._mask_starts[k]] = True
-                self.unable[copy, self._mask_owners[k]] = int(steps[copy])
-
-    def check_unable(self, infos: list[dict[str, Any]]) -> None:
-        """
-        Check that agents whose masks allowed no action were out of play in the step that followed.
-
-        Only now is it known: an agent that is not on turn, for instance, is.
-
-        :param infos: Of that step
-        :raises ValueError: If one was in play
-        """
-        for (copy, i), step in self.unable.items():
-            if infos[copy]["active"][i]:
-                raise self.refuse_unable((copy, i), step)
-
-    def refuse_unable(self, which: tuple[int, int], step: int) -> ValueError:
-        """
-        Return the error for an agent whose mask allows no action although it is in play.
-
-        :param which: Copy and number of the agent
-        :param step: Of its episode, in which the mask was given
-        """
-        agent = self._agents[which[1]]
-        return ValueError(
-            f"The action mask of {agent!r} {place(which[0], step)} allows no action: a model must always choose one, so allow"
-            " one that does nothing. If it could not act in the next step, as one that is not on turn, let the environment"
-            f" say infos[{agent!r}]['active'] = False there. A turn-based AEC game is converted by"
-            " sb3_belief.envs.to_parallel(env, turn_based=True)."
-        )
-
-
-def _name(agent: str, key: str | None) -> str:
-    return f"observation of {agent!r}" if key is None else f"entry {key!r} of the observation of {agent!r}"
-
-
-def _all_finite(values: np.ndarray) -> bool:
-    # The fastest look at all numbers: zero times any number is zero, but not zero times NaN or infinity
-    flat = values.reshape(-1)
-    with np.errstate(invalid="ignore"):
-        return flat.dot(np.zeros(flat.size, dtype=flat.dtype)) == 0.0
-
-
-def _bounds(space: spaces.Space) -> tuple[Any, Any]:
-    """Return the bounds of actions; for a ``Box`` with a margin, because rescaling rounds."""
-    if isinstance(space, spaces.Discrete):
-        return 0, int(space.n) - 1
-    if isinstance(space, spaces.MultiDiscrete):
-        return np.zeros_like(space.nvec), space.nvec - 1
-    if isinstance(space, spaces.Box):
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        margin = np.where(np.isfinite(low) & np.isfinite(high), 1e-4 * (high - low), 0.0)
-        return low - margin, high + margin
-    return 0, 1
+    def _of_each(self, what: str, call: Callable[[int], list[Any]], indices: VecEnvIndices) -> list[Any]:
+        """Ask one copy after the other, so that an error can name its copy."""
+        results = []
+        for copy in self._get_indices(indices):
+            try:
+                results += call(copy)
+            except Exception as error:
+                self.envs[copy].name_place(error, what)
+                raise
+        return results

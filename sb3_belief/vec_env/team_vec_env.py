@@ -80,7 +80,8 @@ class TeamVecEnv(VecEnv):
     Entries of the environment never replace one of the others. At the end of the team's episode it also holds
     ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool, ``is_success`` bool (if the environment reports it:
     then at every end, False where it says nothing), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
-    and ``agent_episode_rewards`` float64 ``[n]``.
+    and ``agent_episode_rewards`` float64 ``[n]``. Where a copy has failed and was made anew, its episode ends so too, with
+    rewards of 0 and ``worker_restarted`` True.
 
     :param num_envs: Number of copies
     :param possible_agents: Names of the agents; their order is the order of every array over agents
@@ -154,6 +155,11 @@ class TeamVecEnv(VecEnv):
         :return: bool ``[num_envs, k]`` by agent, or None if the environment has no masks
         """
         return None
+
+    @property
+    def n_restarts(self) -> int:
+        """How often copies have been made anew after a fault."""
+        return 0
 
     # The VecEnv interface
 

@@ -1,72 +1,38 @@
 """
 Copies of a team environment in worker processes: SB3's ``SubprocVecEnv``, with each step sent back as one row of bytes.
 
-The results of a step have the same shapes and types at every step. A worker therefore packs them into one row of a structured
-array, and the main process reads the rows of all copies as a single array. Pickling a step's dictionaries, arrays and records
-one by one and stacking them again took most of the time that workers cost.
+What can go wrong in a worker is told here in the same way as if the copy were in this process: what the environment raises is
+raised, and a worker that dies or hangs is named, with its copy and step.
 """
 
 import pickle
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from multiprocessing.connection import Connection
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvIndices, VecEnvStepReturn
-from stable_baselines3.common.vec_env.subproc_vec_env import _worker
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from sb3_belief.common.processes import Inbox, check_may_have_workers, leave_interrupts_to_main, start_context
-from sb3_belief.vec_env.action_masks import mask_width
-from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
-from sb3_belief.vec_env.observation_forms import parts_of
+from sb3_belief.common.processes import (
+    WorkerError,
+    WorkerTimeoutError,
+    check_may_have_workers,
+    is_dead,
+    kill_workers,
+    uninterrupted,
+)
+from sb3_belief.common.sent_errors import SentError, rebuilt_error
+from sb3_belief.vec_env.events import Flags
+from sb3_belief.vec_env.joint_env import JointEnv
+from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
 from sb3_belief.vec_env.team_vec_env import ObservationStack
-
-# Messages with a step's actions begin with this byte; all other messages are pickles, which begin with another one
-_STEP = b"s"
-# Fields of a row that become entries of infos; step_wait() relies on agent_rewards being the first
-_INFO_FIELDS = ("agent_rewards", "visible", "active", "life_end", "truncated")
-
-
-def row_type(
-    observation_spaces: dict[str, spaces.Space],
-    action_spaces: dict[str, spaces.Space],
-    scripted_action_spaces: dict[str, spaces.Space],
-) -> np.dtype:
-    """
-    Return the structured type of a row, which holds a joint step of one copy.
-
-    :param observation_spaces: Observation space of each agent
-    :param action_spaces: Action space of each agent
-    :param scripted_action_spaces: Action space of each scripted other
-    :return: The type; in ``observations``, the field of an agent has its number as its name, and so have the fields of the
-        entries of a dict within it
-    """
-    n = len(observation_spaces)
-    observations = [(str(i), *_field(space)) for i, space in enumerate(observation_spaces.values())]
-    return np.dtype(
-        [
-            ("observations", observations),
-            ("reward", np.float32),
-            ("done", bool),
-            ("agent_rewards", np.float32, (n,)),
-            ("visible", bool, (n, n - 1 + len(scripted_action_spaces))),
-            *((name, bool, (n,)) for name in ("active", "life_end", "truncated")),
-            ("scripted_actions", np.float32, (sum(map(spaces.flatdim, scripted_action_spaces.values())),)),
-            ("has_masks", bool),
-            ("action_masks", bool, (sum(map(mask_width, action_spaces.values())),)),
-        ]
-    )
-
-
-def _field(space: spaces.Space) -> tuple[Any, ...]:
-    """Return type and, except for a dict, shape of the field of an agent's observations."""
-    if isinstance(space, spaces.Dict):
-        return ([(str(j), *_field(part)) for j, part in enumerate(space.spaces.values())],)
-    return space.dtype, space.shape or ()
+from sb3_belief.vec_env.validation import place
+from sb3_belief.vec_env.worker_line import WorkerLine, close_lines
+from sb3_belief.vec_env.worker_loop import FAILED, STEP
+from sb3_belief.vec_env.worker_rows import RowPacker, RowReader
 
 
 class WorkersVecEnv(SubprocVecEnv):
@@ -76,30 +42,45 @@ class WorkersVecEnv(SubprocVecEnv):
     The workers leave Ctrl-C to the main process.
 
     :param env_fns: One callable for each copy, which makes its ``JointEnv``
+    :param step_timeout: Seconds within which a worker must answer; None for no limit
+    :param restart_workers: How often a worker of a copy may be replaced
     """
 
-    # Rewards of the last step, float32 [num_envs, n]
-    agent_rewards: np.ndarray
-    # Masks for the next actions, those of all agents side by side, bool [num_envs, sum of their widths]; None without masks
-    action_masks: np.ndarray | None = None
+    # Set by set_members()
+    _rows: RowReader
+    _stack: ObservationStack
 
-    def __init__(self, env_fns: list[Callable[[], JointEnv]]):
+    def __init__(self, env_fns: Sequence[Callable[[], JointEnv]], step_timeout: float | None = None, restart_workers: int = 0):
         check_may_have_workers('vec_env="subproc"', 'vec_env="dummy"')
         self.waiting = self.closed = False
+        self.restarts = Restarts(len(env_fns), restart_workers)
+        #: How many steps each copy's episode has had, for messages
+        self.steps_so_far: Callable[[], Any] = lambda: [0] * len(env_fns)
+        # Seconds of the longest step, copies whose worker does not answer, and what the last step or reset returned
+        self._longest, self._at_fault = 0.0, set[int]()
+        self._last: tuple[Any, Any, Any] = {}, None, ()
         # SB3's constructor is not called, because it would start its own function in the workers. Otherwise this does the same
-        context = start_context()
-        self.remotes, self.work_remotes = zip(*[context.Pipe() for _ in env_fns], strict=True)
-        self.processes = []
-        for work_remote, remote, env_fn in zip(self.work_remotes, self.remotes, env_fns, strict=True):
-            process = context.Process(target=_serve, args=(work_remote, remote, CloudpickleWrapper(env_fn)), daemon=True)
-            process.start()
-            self.processes.append(process)
-            work_remote.close()
-        self.inboxes = [Inbox(remote, process) for remote, process in zip(self.remotes, self.processes, strict=True)]
-        self.remotes[0].send(("get_spaces", None))
-        VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
-        self._observation_spaces: dict[str, spaces.Space] = {}
-        self._row_type = np.dtype([])
+        self._lines: list[WorkerLine] = []
+        try:
+            for copy, env_fn in enumerate(env_fns):
+                self._lines.append(WorkerLine(copy, env_fn, step_timeout, self._on_fault))
+            self.processes = [line.process for line in self._lines]
+            self.remotes: Any = tuple(self._lines)
+            self.remotes[0].send(("get_spaces", None))
+            VecEnv.__init__(self, len(env_fns), *self.remotes[0].recv())
+        except BaseException:
+            self._end_all()
+            raise
+
+    @property
+    def agent_rewards(self) -> np.ndarray:
+        """Rewards of the last step, float32 ``[num_envs, n]``."""
+        return self._rows.agent_rewards
+
+    @property
+    def action_masks(self) -> np.ndarray | None:
+        """Masks for the next actions, those of all agents side by side, bool ``[num_envs, width]``; None without masks."""
+        return self._rows.action_masks
 
     def set_members(
         self,
@@ -114,10 +95,9 @@ class WorkersVecEnv(SubprocVecEnv):
         :param action_spaces: Action space of each agent
         :param scripted_action_spaces: Action space of each scripted other
         """
-        self._observation_spaces = observation_spaces
+        self._members = observation_spaces, action_spaces, scripted_action_spaces
         self._stack = ObservationStack(self.num_envs, observation_spaces)
-        self._row_type = row_type(observation_spaces, action_spaces, scripted_action_spaces)
-        self._info_names = _INFO_FIELDS + ("scripted_actions",) * bool(scripted_action_spaces)
+        self._rows = RowReader(*self._members)
 
     def step(self, actions: Any) -> VecEnvStepReturn:
         """
@@ -128,78 +108,20 @@ class WorkersVecEnv(SubprocVecEnv):
 
         :param actions: For each copy, the actions by agent
         :return: As for :meth:`step_wait`
-        :raises RuntimeError: If a worker has died
+        :raises WorkerError: If a worker has died, or has not answered in time
+        :raises BaseException: What an environment raised
         """
         self.finish_step()
-        with self._reports_deaths("step"):
-            with _uninterrupted():
-                self.step_async(actions)
-            self._await_steps()
-            with _uninterrupted():
-                return self.step_wait()
-
-    def finish_step(self) -> None:
-        """Receive and discard the results of an interrupted step, if there is one."""
-        if self.waiting:
-            with self._reports_deaths("step"):
-                self._await_steps()
-                self.step_wait()
-
-    def _await_steps(self) -> None:
-        # The last worker to start is likely the last to finish, so waiting for it first wakes this process only once
-        for inbox in reversed(self.inboxes):
-            inbox.wait()
-
-    def reset(self) -> Any:
-        self.finish_step()
-        with self._reports_deaths("reset"):
-            # As in SB3, which cannot stack nested dicts
-            for remote, seed, options in zip(self.remotes, self._seeds, self._options, strict=True):
-                remote.send(("reset", (seed, options)))
-            observations, self.reset_infos = zip(*[remote.recv() for remote in self.remotes], strict=True)  # type: ignore
-        self._reset_seeds()
-        self._reset_options()
-        return self._stack(observations)
-
-    def close(self) -> None:
-        self.finish_step()
-        super().close()
-
-    def _get_target_remotes(self, indices: VecEnvIndices) -> list[Any]:
-        # SB3 calls this before each command to the environments (get_attr, env_method, ...), so none of them receives the
-        # results of an interrupted step in place of its own
-        self.finish_step()
-        return super()._get_target_remotes(indices)
-
-    @contextmanager
-    def _reports_deaths(self, doing: str) -> Iterator[None]:
-        """
-        If a worker dies within the block, end the others and say which one it was.
-
-        :param doing: Name of the method, for the message
-        """
-        try:
-            yield
-        except (EOFError, OSError) as error:
-            if self.closed:
-                raise RuntimeError(f"Cannot {doing}: the environment is closed, its worker processes have ended.") from error
-            # A process that has closed its pipe may take a moment to end
-            for process in self.processes:
-                process.join(0.1)
-            dead = [f"{i} (exit code {p.exitcode})" for i, p in enumerate(self.processes) if not p.is_alive()]
-            self._end_all()
-            raise RuntimeError(
-                f"Environment worker process {', '.join(dead) or 'unknown'} died during {doing}(); see its own error above,"
-                " if it could write one. The other workers have been ended: make a new environment to continue."
-            ) from error
-
-    def _end_all(self) -> None:
-        for process in self.processes:
-            process.terminate()
-        for process, remote in zip(self.processes, self.remotes, strict=True):
-            process.join(5.0)
-            remote.close()
-        self.waiting, self.closed = False, True
+        started = time.monotonic()
+        with uninterrupted():
+            self.step_async(actions)
+        step = self.step_wait()
+        seconds = time.monotonic() - started
+        if seconds > self._longest:
+            self._longest = seconds
+            for line in self._lines:
+                line.longest = seconds
+        return step
 
     def step_async(self, actions: Any) -> None:
         """
@@ -207,9 +129,12 @@ class WorkersVecEnv(SubprocVecEnv):
 
         :param actions: For each copy, the actions by agent
         """
-        for remote, chosen in zip(self.remotes, actions, strict=True):
-            remote.send_bytes(_STEP + pickle.dumps(tuple(chosen.values())))
-        self.waiting = True
+        self._check_open("step")
+        self._at_fault = set()
+        for line, chosen in zip(self._lines, actions, strict=True):
+            # A dead worker is found when its answer is missing
+            with suppress(OSError):
+                line.post("step", STEP + pickle.dumps(tuple(chosen.values())))
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -218,127 +143,177 @@ class WorkersVecEnv(SubprocVecEnv):
         :return: Observations ``[num_envs, ...]`` by agent, rewards float32 ``[num_envs]``, dones bool ``[num_envs]`` and infos
             as those of a ``TeamVecEnv``
         """
-        messages = [remote.recv_bytes() for remote in self.remotes]
-        self.waiting = False
-        size = self._row_type.itemsize
-        rows = np.frombuffer(b"".join([message[:size] for message in messages]), dtype=self._row_type)
-        # Copies, since rows are read-only, and whoever kept a view of one field would keep the whole array alive
-        observations = {
-            agent: _unpacked(rows["observations"][str(i)], space)
-            for i, (agent, space) in enumerate(self._observation_spaces.items())
-        }
-        columns = [rows[name].copy() for name in self._info_names]
-        self.agent_rewards = columns[0]
-        infos = [dict(zip(self._info_names, entries, strict=True)) for entries in zip(*columns, strict=True)]
-        # A worker appends a pickle to its row where the infos hold more, as they do at the end of an episode
-        for info, message in zip(infos, messages, strict=True):
-            if len(message) > size:
-                info.update(pickle.loads(message[size:]))
-        self.action_masks = rows["action_masks"].copy() if rows["has_masks"][0] else None
-        return observations, rows["reward"].copy(), rows["done"].copy(), infos
+        self._await_steps()
+        with uninterrupted():
+            messages = self._take(as_bytes=True)
+        size = self._rows.size
+        failed = [copy for copy, each in enumerate(messages) if len(each) != size and each.endswith(FAILED)]
+        if failed or self._at_fault:
+            errors = {copy: rebuilt_error(pickle.loads(messages[copy])) for copy in failed}
+            for copy, (obs, info) in self._restart("step", errors, {}).items():
+                messages[copy] = self._cut_row(copy, obs, info.get("action_masks"))
+        step: Any = self._rows.read(messages)
+        self._last = step[0], step[2], step[3]
+        return step
 
+    def _await_steps(self) -> None:
+        # The last worker to start is likely the last to finish, so waiting for it first wakes this process only once
+        for line in reversed(self._lines):
+            try:
+                if line.wait():
+                    continue
+            except EOFError:
+                pass
+            self._at_fault.add(line.copy)
+            if not self.restarts.limit:
+                # The others need not finish
+                return
 
-def _unpacked(field: np.ndarray, space: spaces.Space) -> Any:
-    """Copy an agent's observations out of the rows of all copies."""
-    if isinstance(space, spaces.Dict):
-        return {key: field[str(j)].copy() for j, key in enumerate(space.spaces)}
-    return field.copy()
+    def _take(self, as_bytes: bool) -> list[Any]:
+        """Return the answers of all workers, something empty for those at fault."""
+        answers: list[Any] = []
+        for line in self._lines:
+            answer: Any = b""
+            if not self._at_fault or (line.copy not in self._at_fault and self.restarts.limit):
+                try:
+                    answer = line.take(as_bytes)
+                except (EOFError, OSError):
+                    self._at_fault.add(line.copy)
+            answers.append(answer)
+        return answers
 
+    def _cut_row(self, copy: int, obs: dict[str, Any], masks: np.ndarray | None) -> bytes:
+        """Return the answer to a step that broke off."""
+        observations, dones, infos = self._last
+        flags = [Flags(info["active"], info["life_end"], info["truncated"]) for info in infos]
+        scripted = self._members[2]
+        width = sum(map(spaces.flatdim, scripted.values()))
+        return RowPacker(*self._members).pack(
+            *cut_step(copy, LastStep(observations, dones, flags), len(scripted), width, obs, masks)
+        )
 
-class PackedSteps:
-    """
-    Steps of one copy in its worker, each packed into a row.
+    def finish_step(self) -> None:
+        """Receive and discard the answers to an interrupted command, if there is one."""
+        for line in self._lines:
+            line.drain()
 
-    :param env: The copy
-    """
+    def reset(self) -> Any:
+        self._check_open("reset")
+        self.finish_step()
+        self._at_fault = set()
+        self.restarts.keep_seeds(self._seeds)
+        commands = {copy: ("reset", data) for copy, data in enumerate(zip(self._seeds, self._options, strict=True))}
+        with uninterrupted():
+            for line in self._lines:
+                with suppress(OSError):
+                    line.post("reset", commands[line.copy])
+        self._await_steps()
+        with uninterrupted():
+            answers = self._take(as_bytes=False)
+        errors = {copy: rebuilt_error(each) for copy, each in enumerate(answers) if isinstance(each, SentError)}
+        if errors or self._at_fault:
+            for copy, answer in self._restart("reset", errors, dict(enumerate(self._options))).items():
+                answers[copy] = answer
+        # As in SB3, which cannot stack nested dicts
+        observations, self.reset_infos = zip(*answers, strict=True)  # type: ignore[assignment]
+        self._reset_seeds()
+        self._reset_options()
+        stacked = self._stack(observations)
+        self._last = stacked, None, ()
+        return stacked
 
-    def __init__(self, env: JointEnv):
-        self._env = env
-        dtype = row_type(env.observation_spaces, env.action_spaces, env.scripted_action_spaces)
-        self._row = np.zeros((), dtype=dtype)
-        # Views of the row, made once: each step writes into them
-        self._observations: list[tuple[str, str | None, np.ndarray]] = []
-        for i, (agent, space) in enumerate(env.observation_spaces.items()):
-            field = self._row["observations"][str(i)]
-            for j, key in enumerate(parts_of(space)):
-                self._observations.append((agent, key, field if key is None else field[str(j)]))
-        self._fields = {name: self._row[name] for name in dtype.names or ()}
-
-    def __call__(self, actions: tuple[Any, ...]) -> bytes:
+    def close(self) -> None:
         """
-        Step the copy, and reset it if its episode ends.
+        End the workers, which close their environments first. None that hangs is waited for.
 
-        :param actions: Actions of the agents, in order
-        :return: The row, followed by a pickle of what the infos hold that has no field in it, if anything. Where an episode
-            has ended, observations and masks are those of the new one
+        :raises BaseException: What an environment raised as it was closed
         """
-        fields = self._fields
-        joint_action = dict(zip(self._env.possible_agents, actions, strict=True))
-        obs, reward, done, record, masks, others = step_and_reset(self._env, joint_action)
-        for agent, key, field in self._observations:
-            field[...] = obs[agent] if key is None else obs[agent][key]
-        fields["reward"][...], fields["done"][...] = reward, done
-        fields["agent_rewards"][...], fields["visible"][...] = record.agent_rewards, record.visible
-        fields["active"][...], fields["life_end"][...], fields["truncated"][...] = record.flags
-        if record.scripted_actions is not None:
-            fields["scripted_actions"][...] = record.scripted_actions
-        fields["has_masks"][...] = masks is not None
-        if masks is not None:
-            fields["action_masks"][...] = masks
-        return self._row.tobytes() + pickle.dumps(others) if others else self._row.tobytes()
+        if self.closed:
+            return
+        self.closed = True
+        for error in close_lines(self._lines):
+            raise error
 
+    def _get_target_remotes(self, indices: VecEnvIndices) -> list[Any]:
+        self._check_open("do that")
+        return super()._get_target_remotes(indices)
 
-class _Channel:
-    """
-    Connection to the main process that answers the commands to step, and passes all others to SB3's worker loop.
+    # Faults
 
-    :param connection: The worker's end of its pipe
-    :param env: The worker's copy
-    """
+    def _check_open(self, doing: str) -> None:
+        if self.closed:
+            raise RuntimeError(f"Cannot {doing}: the environment is closed, its worker processes have ended.")
 
-    def __init__(self, connection: Connection, env: JointEnv):
-        self._connection, self._env = connection, env
-        self._steps: PackedSteps | None = None
-        self.send, self.close = connection.send, connection.close
-
-    def recv(self) -> Any:
+    def _restart(
+        self, doing: str, errors: dict[int, BaseException], options: dict[int, Any]
+    ) -> dict[int, tuple[dict[str, Any], dict[str, Any]]]:
         """
-        Answer commands to step until another command arrives.
+        Make the copies anew that have raised an error or whose worker is at fault, or raise what has happened.
 
-        :return: That command
+        :param doing: What they were to do
+        :param errors: What environments have raised
+        :param options: Of their next reset
+        :return: What the reset of each of them returned
         """
-        while (message := self._connection.recv_bytes()).startswith(_STEP):
-            # Made at the first step: by then the main process has checked that a team can have these spaces
-            self._steps = self._steps or PackedSteps(self._env)
-            self._connection.send_bytes(self._steps(pickle.loads(message[len(_STEP) :])))
-        return pickle.loads(message)
+        causes = {copy: errors[copy] if copy in errors else None for copy in sorted(self._at_fault | errors.keys())}
+        if not all(map(self.restarts.allow, causes)):
+            raise self._broken(doing) if self._at_fault else errors[min(errors)]
+        return {copy: self._restarted(copy, doing, error, options.get(copy)) for copy, error in causes.items()}
 
+    def _restarted(self, copy: int, doing: str, error: BaseException | None, options: Any) -> Any:
+        line, step = self._lines[copy], self._step_number(copy, doing)
+        while True:
+            cause = line.fault(doing) if error is None else error
+            if not self.restarts.allow(copy):
+                raise self._ended([cause], doing, [copy]) if isinstance(cause, WorkerError) else cause
+            seed = self.restarts.count(copy, step, cause)
+            close_lines([line])
+            line.start()
+            self.processes[copy] = line.process
+            error = None
+            try:
+                line.post("reset", ("reset", (seed, options)))
+                if line.wait():
+                    with uninterrupted():
+                        answer = line.take()
+                    if not isinstance(answer, SentError):
+                        return answer
+                    error = rebuilt_error(answer)
+            except (EOFError, OSError):
+                pass
+            doing = "reset"
 
-def _serve(connection: Connection, parent_end: Connection, env_fn: CloudpickleWrapper) -> None:
-    """
-    Run a worker process until its pipe is closed.
+    def _step_number(self, copy: int, doing: str) -> int:
+        return {"reset": 0}.get(doing, int(self.steps_so_far()[copy]) + (doing == "step"))
 
-    :param connection: The worker's end of the pipe
-    :param parent_end: The main process's end of the pipe
-    :param env_fn: Makes the worker's copy
-    """
-    # At Ctrl-C SB3's loop would end, and the environment with it
-    leave_interrupts_to_main()
-    # Closed before the environment is made, since processes that it starts would inherit this end
-    parent_end.close()
-    env = env_fn.var()
-    channel: Any = _Channel(connection, env)
-    _worker(channel, parent_end, CloudpickleWrapper(lambda: env))
+    def _broken(self, doing: str) -> WorkerError:
+        """Return the error for workers that are at fault, of which at least one is known."""
+        for line in self._lines:
+            if line.copy not in self._at_fault:
+                # It may have died of the same cause
+                line.process.join(0.1)
+                if is_dead(line.process):
+                    self._at_fault.add(line.copy)
+        copies = sorted(self._at_fault)
+        return self._ended([self._lines[copy].fault(doing) for copy in copies], doing, copies)
 
+    def _on_fault(self, line: WorkerLine, fault: WorkerError) -> WorkerError:
+        # The command is named in the fault
+        return self._ended([fault], "", [line.copy])
 
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block, on systems that can."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+    def _ended(self, faults: Sequence[BaseException], doing: str, copies: Sequence[int]) -> WorkerError:
+        """End all workers, and return the error that says what has happened."""
+        where = [place(copy, self._step_number(copy, doing)) for copy in copies]
+        self._end_all()
+        kind = next((type(fault) for fault in faults if isinstance(fault, WorkerTimeoutError)), WorkerError)
+        told = "; ".join(f"{fault} {at}" for fault, at in zip(faults, where, strict=True))
+        return kind(
+            f"{told}. See its own error above, if it could write one. The other workers have been"
+            " ended: make a new environment to continue."
+        )
+
+    def _end_all(self) -> None:
+        self.closed = True
+        kill_workers(line.process for line in self._lines)
+        for line in self._lines:
+            line.close()

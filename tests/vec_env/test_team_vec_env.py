@@ -319,9 +319,12 @@ def test_worker_that_dies_is_named():
     env = make_team_env(make, n_envs=2, vec_env="subproc")
     env.reset()
     action = {"agent_0": [0, 0], "agent_1": [0, 0]}
-    with pytest.raises(RuntimeError, match=r"worker process 0 \(exit code 3\), 1 \(exit code 3\) died during step"):
+    with pytest.raises(RuntimeError) as caught:
         for _ in range(20):
             env.step(action)
+    for copy in (0, 1):
+        told = f"worker process {copy} (exit code 3) died during step() in environment copy {copy} at step 3"
+        assert told in str(caught.value)
     assert not any(process.is_alive() for process in env.venv.processes)
     with pytest.raises(RuntimeError, match="closed"):
         env.reset()

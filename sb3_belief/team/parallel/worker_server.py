@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 
 from sb3_belief.common.plain_data import PlainData
-from sb3_belief.common.processes import leave_interrupts_to_main
+from sb3_belief.common.processes import become_worker
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.exact.agent_state import write_agent_state
@@ -262,7 +262,7 @@ def serve(connection: Connection) -> None:
 
     :param connection: To the main process
     """
-    leave_interrupts_to_main()
+    become_worker()
     server = WorkerServer()
     try:
         while True:

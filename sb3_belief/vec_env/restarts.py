@@ -1,0 +1,115 @@
+"""Environment copies that are made anew after a fault: how often, with which seed, and what becomes of the broken episode."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_belief.vec_env.events import Flags, StepRecord, no_flags
+from sb3_belief.vec_env.observation_forms import copied, row_of
+from sb3_belief.vec_env.validation import place
+
+CutStep = tuple[dict[str, Any], float, bool, StepRecord, np.ndarray | None, dict[str, Any]]
+
+
+class LastStep(NamedTuple):
+    """
+    What the last step or reset of all copies returned, as far as a broken step needs it.
+
+    :param observations: ``[num_envs, ...]`` by agent
+    :param dones: bool ``[num_envs]``; None after a reset
+    :param flags: Each copy's flags, whose arrays are read only
+    """
+
+    observations: Mapping[str, Any]
+    dones: Sequence[Any] | np.ndarray | None = None
+    flags: Sequence[Flags] = ()
+
+
+class Restarts:
+    """
+    Counts the restarts of each copy.
+
+    :param num_envs: Number of copies
+    :param limit: How often each copy may be made anew
+    """
+
+    def __init__(self, num_envs: int, limit: int):
+        self.limit = limit
+        #: How often each copy has been made anew
+        self.counts = [0] * num_envs
+        #: The last seed that each copy was given; None for none
+        self.seeds: list[int | None] = [None] * num_envs
+
+    def keep_seeds(self, seeds: Sequence[int | None]) -> None:
+        """
+        Keep the seeds of a reset.
+
+        :param seeds: One for each copy; None where it goes on with its random numbers
+        """
+        self.seeds = [old if new is None else new for old, new in zip(self.seeds, seeds, strict=True)]
+
+    def allow(self, copy: int) -> bool:
+        """
+        Return whether a copy may be made anew.
+
+        :param copy: Number of the copy
+        """
+        return self.counts[copy] < self.limit
+
+    def count(self, copy: int, step: int, cause: BaseException) -> int | None:
+        """
+        Count a restart, and warn of it.
+
+        :param copy: Number of the copy
+        :param step: Of its episode; 0 for a reset
+        :param cause: What has happened to it
+        :return: Seed of the new copy: drawn from the copy's last seed and the number of its restarts; None if it has none
+        """
+        self.counts[copy] += 1
+        n, seed = self.counts[copy], self.seeds[copy]
+        told = f"{type(cause).__name__}: {cause}" if str(cause) else type(cause).__name__
+        broken = "; its episode is cut off there, and counted as truncated" if step else ""
+        warnings.warn(
+            f"The environment has failed {place(copy, step)}, and the copy is made anew (restart {n} of {self.limit}){broken}."
+            f" Cause: {told}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return None if seed is None else int(np.random.SeedSequence((seed, n)).generate_state(1)[0] % 2**31)
+
+
+def cut_step(
+    copy: int, last: LastStep, n_scripted: int, scripted_width: int, obs: dict[str, Any], masks: np.ndarray | None
+) -> CutStep:
+    """
+    Return the step at which an episode broke off, as ``step_and_reset`` would.
+
+    Nothing is gained in it, and learners bootstrap from the last observations, as they do at a time limit.
+
+    :param copy: Number of the copy
+    :param last: What it returned last
+    :param n_scripted: Number of scripted others
+    :param scripted_width: Width of their actions
+    :param obs: First observations of the copy that takes its place
+    :param masks: Masks there
+    :return: As of ``step_and_reset``
+    """
+    n = len(last.observations)
+    flags = no_flags(n)
+    if last.dones is None or last.dones[copy]:
+        flags.active[:] = True
+    else:
+        before = last.flags[copy]
+        # Whose return ended in the last step may have left
+        flags.active[:] = before.active & ~(before.life_end | before.truncated)
+        if not flags.active.any():
+            flags.active[:] = before.active
+    flags.truncated[:] = flags.active
+    # Nobody has seen what followed
+    visible = np.zeros((n, n - 1 + n_scripted), dtype=bool)
+    scripted = np.zeros(scripted_width, dtype=np.float32) if n_scripted else None
+    seen = {agent: copied(row_of(each, copy)) for agent, each in last.observations.items()}
+    others = {"TimeLimit.truncated": True, "terminal_observation": seen, "worker_restarted": True}
+    return obs, 0.0, True, StepRecord([0.0] * n, flags, visible, masks, scripted), masks, others
