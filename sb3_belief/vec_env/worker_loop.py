@@ -69,7 +69,9 @@ class _Channel:
 
 def _what(command: str, data: Any) -> str:
     """Return what a command does, for a message."""
-    return {"env_method": lambda: f"{data[0]}()", "get_attr": lambda: f"attribute {data!r}"}.get(command, lambda: command)()
+    if command == "get_attr":
+        return f"attribute {data!r}"
+    return f"{data[0] if command == 'env_method' else command}()"
 
 
 def serve_env(connection: Connection, parent_end: Connection, env_fn: CloudpickleWrapper) -> None:

@@ -160,14 +160,14 @@ class WorkersVecEnv(SubprocVecEnv):
         # The last worker to start is likely the last to finish, so waiting for it first wakes this process only once
         for line in reversed(self._lines):
             try:
-                if line.wait():
-                    continue
+                if not line.wait():
+                    # The time of the others is over, too
+                    self._at_fault.add(line.copy)
             except EOFError:
-                pass
-            self._at_fault.add(line.copy)
-            if not self.restarts.limit:
-                # The others need not finish
-                return
+                self._at_fault.add(line.copy)
+                if not self.restarts.limit:
+                    # The others need not finish
+                    return
 
     def _take(self, as_bytes: bool) -> list[Any]:
         """Return the answers of all workers, something empty for those at fault."""
