@@ -159,7 +159,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
     def _copies_state(self) -> dict[str, Any]:
         # As text, which takes less than the tree when it is written once more
         copies = [(own, json.dumps(state.tree), state.blob) for own, state in self.venv.env_method("get_copy_state")]
-        return {"copies": copies, "masks": self._masks, "unable": dict(self._checks.unable)}
+        restarts = self.venv.restarts.state()
+        return {"copies": copies, "masks": self._masks, "unable": dict(self._checks.unable), "restarts": restarts}
 
     def _set_copies_state(self, state: dict[str, Any]) -> None:
         # An environment has all its parts only after a reset
@@ -167,6 +168,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
         for copy, (own, tree, blob) in enumerate(state["copies"]):
             self.venv.env_method("set_copy_state", own, PlainData(json.loads(tree), blob), indices=copy)
         self._masks, self._checks.unable = state["masks"], state["unable"]
+        self.venv.restarts.set_state(state["restarts"])
 
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         # Plain integers for Discrete: what PettingZoo environments are tested with. Copies of others: an environment may write
@@ -220,7 +222,6 @@ class _InProcessVecEnv(DummyVecEnv):
         VecEnv.__init__(self, len(envs), first.observation_space, first.action_space)
         self._stack = ObservationStack(len(envs), first.observation_spaces)
         self.restarts, self._env_fns = Restarts(len(envs), restart_workers), list(env_fns)
-        self._last = LastStep({})
 
     def reset(self) -> Any:
         """
@@ -239,7 +240,7 @@ class _InProcessVecEnv(DummyVecEnv):
         self._reset_seeds()
         self._reset_options()
         stacked = self._stack([obs for obs, _ in resets])
-        self._last = LastStep(stacked)
+        self.restarts.last = LastStep(stacked)
         return stacked
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -275,17 +276,16 @@ class _InProcessVecEnv(DummyVecEnv):
                 info.update(other)
             infos.append(info)
         self.action_masks = None if masks[0] is None else np.array(masks)
-        stacked = self._stack(observations)
-        if self.restarts.limit:
-            self._last = LastStep(stacked, dones, [record.flags for record in records])
-        return stacked, np.array(rewards, dtype=np.float32), np.array(dones), infos
+        stacked, ended = self._stack(observations), np.array(dones)
+        self.restarts.last = LastStep(stacked, ended, infos)
+        return stacked, np.array(rewards, dtype=np.float32), ended, infos
 
     def _cut(self, copy: int, error: Exception) -> Any:
         """Return the step of a copy that has raised an error in it."""
         obs, info = self._made_anew(copy, int(self.steps_so_far()[copy]) + 1, error)
         scripted = self.envs[copy].scripted_action_spaces
         width = sum(map(spaces.flatdim, scripted.values()))
-        return cut_step(copy, self._last, len(scripted), width, obs, info.get("action_masks"))
+        return cut_step(copy, self.restarts.last, len(scripted), width, obs, info.get("action_masks"))
 
     def _made_anew(self, copy: int, step: int, cause: Exception, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Make a copy anew and reset it, or raise what has happened to it."""

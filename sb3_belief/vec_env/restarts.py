@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_belief.vec_env.events import Flags, StepRecord, no_flags
+from sb3_belief.vec_env.events import StepRecord, no_flags
 from sb3_belief.vec_env.observation_forms import copied, row_of
 from sb3_belief.vec_env.validation import place
 
+_FLAGS = ("active", "life_end", "truncated")
 CutStep = tuple[dict[str, Any], float, bool, StepRecord, np.ndarray | None, dict[str, Any]]
 
 
@@ -19,17 +20,17 @@ class LastStep(NamedTuple):
 
     :param observations: ``[num_envs, ...]`` by agent
     :param dones: bool ``[num_envs]``; None after a reset
-    :param flags: Each copy's flags, whose arrays are read only
+    :param infos: Those of the step
     """
 
     observations: Mapping[str, Any]
-    dones: Sequence[Any] | np.ndarray | None = None
-    flags: Sequence[Flags] = ()
+    dones: np.ndarray | None = None
+    infos: Sequence[Mapping[str, Any]] = ()
 
 
 class Restarts:
     """
-    Counts the restarts of each copy.
+    Counts the restarts of each copy, and keeps what they need.
 
     :param num_envs: Number of copies
     :param limit: How often each copy may be made anew
@@ -41,6 +42,8 @@ class Restarts:
         self.counts = [0] * num_envs
         #: The last seed that each copy was given; None for none
         self.seeds: list[int | None] = [None] * num_envs
+        #: What all copies returned last
+        self.last = LastStep({})
 
     def keep_seeds(self, seeds: Sequence[int | None]) -> None:
         """
@@ -49,6 +52,27 @@ class Restarts:
         :param seeds: One for each copy; None where it goes on with its random numbers
         """
         self.seeds = [old if new is None else new for old, new in zip(self.seeds, seeds, strict=True)]
+
+    def state(self) -> dict[str, Any]:
+        """Return the state as plain data, for :meth:`set_state`."""
+        last = self.last
+        flags = [[info[name] for name in _FLAGS] for info in last.infos]
+        return {
+            "counts": list(self.counts),
+            "seeds": list(self.seeds),
+            "last": (dict(last.observations), last.dones, np.array(flags)) if self.limit else None,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """
+        Restore a state, after a reset.
+
+        :param state: As :meth:`state` returned it
+        """
+        self.counts, self.seeds = list(state["counts"]), list(state["seeds"])
+        if state["last"] is not None:
+            observations, dones, flags = state["last"]
+            self.last = LastStep(observations, dones, [dict(zip(_FLAGS, row, strict=True)) for row in flags])
 
     def allow(self, copy: int) -> bool:
         """
@@ -101,11 +125,11 @@ def cut_step(
     if last.dones is None or last.dones[copy]:
         flags.active[:] = True
     else:
-        before = last.flags[copy]
+        active, life_end, truncated = (last.infos[copy][name] for name in _FLAGS)
         # Whose return ended in the last step may have left
-        flags.active[:] = before.active & ~(before.life_end | before.truncated)
+        flags.active[:] = active & ~(life_end | truncated)
         if not flags.active.any():
-            flags.active[:] = before.active
+            flags.active[:] = active
     flags.truncated[:] = flags.active
     # Nobody has seen what followed
     visible = np.zeros((n, n - 1 + n_scripted), dtype=bool)

@@ -156,11 +156,6 @@ class TeamVecEnv(VecEnv):
         """
         return None
 
-    @property
-    def n_restarts(self) -> int:
-        """How often copies have been made anew after a fault."""
-        return 0
-
     # The VecEnv interface
 
     def reset(self) -> TeamObs:

@@ -25,7 +25,6 @@ from sb3_belief.common.processes import (
     uninterrupted,
 )
 from sb3_belief.common.sent_errors import SentError, rebuilt_error
-from sb3_belief.vec_env.events import Flags
 from sb3_belief.vec_env.joint_env import JointEnv
 from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
 from sb3_belief.vec_env.team_vec_env import ObservationStack
@@ -56,9 +55,8 @@ class WorkersVecEnv(SubprocVecEnv):
         self.restarts = Restarts(len(env_fns), restart_workers)
         #: How many steps each copy's episode has had, for messages
         self.steps_so_far: Callable[[], Any] = lambda: [0] * len(env_fns)
-        # Seconds of the longest step, copies whose worker does not answer, and what the last step or reset returned
+        # Seconds of the longest step, and copies whose worker does not answer
         self._longest, self._at_fault = 0.0, set[int]()
-        self._last: tuple[Any, Any, Any] = {}, None, ()
         # SB3's constructor is not called, because it would start its own function in the workers. Otherwise this does the same
         self._lines: list[WorkerLine] = []
         try:
@@ -153,7 +151,7 @@ class WorkersVecEnv(SubprocVecEnv):
             for copy, (obs, info) in self._restart("step", errors, {}).items():
                 messages[copy] = self._cut_row(copy, obs, info.get("action_masks"))
         step: Any = self._rows.read(messages)
-        self._last = step[0], step[2], step[3]
+        self.restarts.last = LastStep(step[0], step[2], step[3])
         return step
 
     def _await_steps(self) -> None:
@@ -184,13 +182,9 @@ class WorkersVecEnv(SubprocVecEnv):
 
     def _cut_row(self, copy: int, obs: dict[str, Any], masks: np.ndarray | None) -> bytes:
         """Return the answer to a step that broke off."""
-        observations, dones, infos = self._last
-        flags = [Flags(info["active"], info["life_end"], info["truncated"]) for info in infos]
         scripted = self._members[2]
         width = sum(map(spaces.flatdim, scripted.values()))
-        return RowPacker(*self._members).pack(
-            *cut_step(copy, LastStep(observations, dones, flags), len(scripted), width, obs, masks)
-        )
+        return RowPacker(*self._members).pack(*cut_step(copy, self.restarts.last, len(scripted), width, obs, masks))
 
     def finish_step(self) -> None:
         """Receive and discard the answers to an interrupted command, if there is one."""
@@ -219,7 +213,7 @@ class WorkersVecEnv(SubprocVecEnv):
         self._reset_seeds()
         self._reset_options()
         stacked = self._stack(observations)
-        self._last = stacked, None, ()
+        self.restarts.last = LastStep(stacked)
         return stacked
 
     def close(self) -> None:

@@ -130,3 +130,26 @@ class WithChild(Troubled):
         super().__init__(*args, **kwargs)
         # Not kept: nobody waits for it
         subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
+
+
+class Troubling:
+    """
+    Another environment with a fault at a step, once.
+
+    :param env_class: Its class
+    :param at: At which step of the first episode
+    :param folder: Folder in which the fault is counted
+    """
+
+    def __new__(cls, env_class, at, folder):
+        env, counted = env_class(), Path(folder, "fault")
+        step = env.step
+
+        def troubled(actions):
+            if env.t + 1 == at and not counted.exists():
+                counted.touch()
+                raise OwnError("once")
+            return step(actions)
+
+        env.step = troubled
+        return env
