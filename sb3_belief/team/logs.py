@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 from stable_baselines3.common.utils import get_latest_run_id, safe_mean
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.file_names import file_name
 from sb3_belief.team.log_files import counters, open_logger, put_counters_back, sync_logger, table_state
@@ -203,19 +204,24 @@ class TeamLog:
             logger.close()
 
 
-def record_statistics(logger: Logger, episodes: Collection[dict[str, Any]], successes: Collection[bool]) -> None:
+def record_statistics(
+    logger: Logger, episodes: Collection[dict[str, Any]], successes: Collection[bool], env: VecEnv | None = None
+) -> None:
     """
-    Record the means over the last episodes.
+    Record the means over the last episodes, and how often copies of the environment have been made anew, if any have.
 
     :param logger: Logger of the team
     :param episodes: What ``info["episode"]`` said of them
     :param successes: Whether they were successes, as far as the environment says so
+    :param env: The team's environment
     """
     if episodes:
         logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in episodes]))
         logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in episodes]))
     if successes:
         logger.record("rollout/success_rate", safe_mean(list(successes)))
+    if env is not None and (restarts := getattr(env.unwrapped, "n_restarts", 0)):
+        logger.record("rollout/worker_restarts", restarts)
 
 
 def record_time(logger: Logger, iterations: int, num_timesteps: int, start_timesteps: int, start_time: int) -> None:

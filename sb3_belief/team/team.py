@@ -191,6 +191,7 @@ class Team(SB3Protocol):
         check_callbacks(self._agents.models, bool(self._agents.statistics), team_callback, own_callbacks)
         self.check_learn(total_timesteps)
         self._exact.check_learn(reset_num_timesteps)
+        self._parallel.begin(reset_num_timesteps)
         with self._exclusively():
             log = self._make_log(tb_log_name)
             if reset_num_timesteps:
@@ -291,7 +292,9 @@ class Team(SB3Protocol):
             "normalize": self.normalize,
             **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
-        write_team(path, self.agents, self._agents.statistics, manifest, {} if state is None else state.parts())
+        write_team(
+            path, self._parallel.models_to_save(), self._agents.statistics, manifest, {} if state is None else state.parts()
+        )
 
     @classmethod
     def load(
@@ -394,7 +397,7 @@ class Team(SB3Protocol):
     def dump_logs(self) -> None:
         """Write the team's table: what has been recorded, and statistics of episodes and time."""
         self._iterations += 1
-        record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer)
+        record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer, self.get_env())
         record_time(self.logger, self._iterations, self.num_timesteps, self._start_timesteps, self._start_time)
         self.logger.dump(step=self.num_timesteps)
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.processes import check_may_have_workers
 from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
@@ -81,6 +82,8 @@ class ParallelLearning:
         self._models, self._rngs, self._jobs = models, rngs, check_jobs(jobs)
         self._workers = Workers()
         self._groups: list[RemoteAgents] = []
+        # Why this team is not whole, if its agents are not as far as each other
+        self._mixed: str | None = None
         self._on_policy()
 
     def _on_policy(self) -> dict[str, OnPolicyAlgorithm]:
@@ -92,6 +95,48 @@ class ParallelLearning:
                     ' device="cpu".'
                 )
         return found
+
+    def begin(self, counts_anew: bool) -> None:
+        """
+        Check that the team is whole before it learns further.
+
+        :param counts_anew: Whether its steps are counted from 0 on, so that its agents are what a new training begins with
+        :raises ValueError: If a worker's end has left agents behind the others, and their steps are counted on
+        """
+        if counts_anew:
+            self._mixed = None
+        self._check_whole()
+
+    def models_to_save(self) -> dict[str, BaseAlgorithm]:
+        """
+        Return the models of the team as they are now.
+
+        :raises ValueError: If a worker's end has left agents behind the others
+        """
+        self._check_whole()
+        self.sync_models()
+        return dict(self._models)
+
+    def _check_whole(self) -> None:
+        if self._mixed is not None:
+            raise ValueError(
+                f"{self._mixed} One file, or one count of steps, would hide that: load the last checkpoint (Team.load), or"
+                " begin a new training with these models by learn(..., reset_num_timesteps=True). A single model is saved by"
+                " team.agents[agent].save(path)."
+            )
+
+    def _note_who_is_behind(self, error: BaseException) -> None:
+        """Remember, and add to an error, whose models are not what they had become in a worker."""
+        behind = {agent for group in self._groups for agent in group.behind}
+        if behind:
+            steps = {agent: model.num_timesteps for agent, model in self._models.items()}
+            back = ", ".join(f"{agent!r} at step {steps[agent]}" for agent in steps if agent in behind)
+            others = ", ".join(f"{agent!r} at step {steps[agent]}" for agent in steps if agent not in behind)
+            self._mixed = (
+                "The agents of this team are not equally far, because a worker process ended before its models came back: as"
+                f" they were before are {back}; as far as they came are {others}."
+            )
+            add_note(error, self._mixed)
 
     def sync_models(self) -> None:
         """Bring the models in this process up to date with those in the workers."""
@@ -128,14 +173,16 @@ class ParallelLearning:
                 yield self._groups
             for group in self._groups:
                 group.close()
-        except BaseException:
+        except BaseException as error:
             try:
-                # What a worker that is dead or has failed cannot send back stays as it was
+                # What a worker that is dead or has failed cannot send back stays as it was. One that hangs is not waited for
+                deadline = self._workers.deadline()
                 for group in self._groups:
                     with suppress(Exception):
-                        group.close()
+                        group.close(deadline)
             finally:
                 self._workers.end()
+                self._note_who_is_behind(error)
             raise
         finally:
             self._groups = []

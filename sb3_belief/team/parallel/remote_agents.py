@@ -10,6 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.rng import RngState
+from sb3_belief.common.sent_errors import rebuilt_error
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.parallel.messages import dumps, loads
 from sb3_belief.team.parallel.model_state import pack, write_state
@@ -20,6 +21,8 @@ from sb3_belief.vec_env.team_vec_env import TeamObs
 
 # For Python's rule that a warning is shown once per place
 _shown: dict[Any, Any] = {}
+# Commands after which models are as before
+_LEARN_NOTHING = ("open", "act", "sync", "close")
 
 
 class RemoteAgents:
@@ -50,6 +53,13 @@ class RemoteAgents:
         # Whether the models are there, whether a command is being carried out, and whether one was since the last sync
         self._is_open, self._is_busy, self._is_stale = False, False, False
         self._answer: dict[str, Any] | None = None
+        # Whether the agents have learned since their models were last brought here, and whose models have come back since
+        self._has_learned, self._returned = False, set[str]()
+
+    @property
+    def behind(self) -> list[str]:
+        """The agents whose models here are not what they have become in the worker."""
+        return [agent for agent in self.agents if self._has_learned and agent not in self._returned]
 
     def _send(self, method: str, *args: Any, is_answered: bool = True) -> None:
         command = Command(method, args, is_answered)
@@ -57,10 +67,12 @@ class RemoteAgents:
         message = dumps(command, {}) if method == "open" else command
         self._workers.send(self._number, message, ", ".join(self.agents))
         self._is_busy, self._is_stale = is_answered, True
+        if method not in _LEARN_NOTHING:
+            self._has_learned, self._returned = True, set()
 
-    def _receive(self) -> dict[str, Any]:
+    def _receive(self, deadline: float | None = None) -> dict[str, Any]:
         """Return the answer to the last command, after its output, warnings and logs are shown and written here."""
-        answer = loads(self._workers.receive(self._number))
+        answer = loads(self._workers.receive(self._number, deadline))
         self._is_busy = False
         if answer["output"]:
             sys.stdout.write(answer["output"])
@@ -121,10 +133,10 @@ class RemoteAgents:
         _raise_failure(answer)
         return answer["states"], answer["actions"]
 
-    def _wait(self) -> None:
+    def _wait(self, deadline: float | None = None) -> None:
         """Keep the answer to the last command until the loop asks for it."""
         if self._is_busy:
-            self._answer = self._receive()
+            self._answer = self._receive(deadline)
 
     def _of_these(self, masks: TeamObs | None) -> TeamObs | None:
         return None if masks is None else {agent: masks[agent] for agent in self.agents if agent in masks}
@@ -142,35 +154,31 @@ class RemoteAgents:
             self._fetch("sync")
             self._is_stale = False
 
-    def close(self) -> None:
+    def close(self, deadline: float | None = None) -> None:
         """
         Bring the models here up to date, rollout buffers included, and end what runs in the worker.
 
+        :param deadline: Until when to wait for it, by ``time.monotonic()``; None to wait without a limit
         :raises BaseException: If that fails
         """
         if self._is_open:
             self._is_open = False
-            self._wait()
-            self._fetch("close")
+            self._wait(deadline)
+            self._fetch("close", deadline)
 
-    def _fetch(self, method: str) -> None:
+    def _fetch(self, method: str, deadline: float | None = None) -> None:
         self._send(method)
-        answer = self._receive()
+        answer = self._receive(deadline)
         for agent, payload in answer["payloads"].items():
             model = self._models[agent]
             write_state(model, payload["model"])
             for wrapper, state in zip(wrappers_of(model.env), payload["wrappers"], strict=True):
                 vars(wrapper).update({key: value for key, value in state.items() if not isinstance(value, spaces.Space)})
             self._rngs[agent].become(payload["rng"])
+            self._returned.add(agent)
         _raise_failure(answer)
 
 
 def _raise_failure(answer: dict[str, Any]) -> None:
     if answer["error"] is not None:
-        # As concurrent.futures shows where it happened
-        raise answer["error"] from _WorkerTraceback(answer["traceback"])
-
-
-class _WorkerTraceback(Exception):
-    def __str__(self) -> str:
-        return f'\n"""\n{self.args[0]}"""'
+        raise rebuilt_error(answer["error"])

@@ -2,7 +2,6 @@
 
 import inspect
 import io
-import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout
@@ -16,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_n
 from sb3_belief.common.plain_data import PlainData
 from sb3_belief.common.processes import become_worker
 from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.common.sent_errors import sent_error
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.exact.agent_state import write_agent_state
 from sb3_belief.team.lockstep.scheduler import AgentTask
@@ -144,7 +144,7 @@ class WorkerServer:
                 elif self._answer["error"] is None:
                     getattr(self._scheduler, method)(*args)
             except BaseException as error:
-                self._answer.update(_failure(error))
+                self._answer["error"] = sent_error(error)
         if not is_answered:
             return None
         if self._scheduler is not None:
@@ -156,7 +156,7 @@ class WorkerServer:
         try:
             return dumps(answer, {})
         except Exception as error:
-            return dumps({**_empty_answer(), **_failure(error)}, {})
+            return dumps({**_empty_answer(), "error": sent_error(error)}, {})
 
     def open(self, payloads: dict[str, AgentPayload], learn: Callable[..., None], scheduler_kwargs: dict[str, Any]) -> None:
         """
@@ -228,7 +228,7 @@ class WorkerServer:
                 reader.mark_as_sent()
             except Exception as error:
                 # The other agents' states are not lost with it
-                self._answer.update(_failure(error))
+                self._answer["error"] = sent_error(error)
 
 
 def _empty_answer() -> dict[str, Any]:
@@ -244,16 +244,6 @@ def _captured(answer: dict[str, Any]) -> Iterator[None]:
         yield
     answer["output"] += output.getvalue()
     answer["warnings"] += [(str(w.message), w.category, w.filename, w.lineno) for w in caught]
-
-
-def _failure(error: BaseException) -> dict[str, Any]:
-    """Return an error and its traceback so that they can be sent."""
-    text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
-    try:
-        loads(dumps(error, {}))
-    except Exception:
-        error = RuntimeError(f"{type(error).__name__}: {error}")
-    return {"error": error, "traceback": text}
 
 
 def serve(connection: Connection) -> None:

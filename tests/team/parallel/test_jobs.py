@@ -316,6 +316,11 @@ def test_a_worker_dies(tmp_path):
     with pytest.raises(RuntimeError, match=r"process 0 .* died while it was busy with agent_0, agent_2"):
         team.learn(64)
     assert no_processes_stay()
+    with pytest.raises(ValueError, match="not equally far"):
+        team.save(tmp_path / "mixed")
+    for model in team.agents.values():
+        model.at = None
+    team.learn(16)
     goes_on(team, tmp_path)
 
 
