@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 from sb3_belief.common.lazy_imports import lazy_attributes
 from sb3_belief.common.versions import __version__
 
-# PyTorch's products on x86 are MKL's, whose last bits may depend on where in memory a matrix happens to lie: one seed could then
-# learn two things, and a resumed run differ from an undisturbed one. MKL reads this at its first product. It costs nothing
+# PyTorch's products on x86 are MKL's, whose last bits may depend on where in memory a matrix happens to lie: one seed could
+# then learn two things, and a resumed run differ from another. MKL reads this at its first product; it costs nothing
 os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
 if TYPE_CHECKING:

@@ -5,6 +5,7 @@ import io
 import os
 import pathlib
 import pickle
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -17,8 +18,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_belief.team.arguments import check_agent_keys, check_total_timesteps
+from sb3_belief.team.arguments import check_agent_keys, check_same_agents, check_team_vec_env, check_total_timesteps
 from sb3_belief.team.checkpoint import read_team
+from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief.team.logs import record_statistics, record_time
 
 # Arguments of algorithms that a team has itself
 _OWN = {"policy", "env", "seed", "verbose", "tensorboard_log"}
@@ -53,8 +56,19 @@ class SB3Protocol:
     ``team.learning_rate``, where all agents have the same value.
     """
 
-    #: Of the team, ``AgentModels``
+    # What a team sets: ``AgentModels``, its loop, its counters and its scripted others' action spaces
     _agents: Any
+    _loop: JointLoop | None
+    _logger: Logger | None
+    _learning: bool
+    _scripted: dict[str, str]
+    possible_agents: list[str]
+    ep_info_buffer: deque[dict[str, Any]]
+    ep_success_buffer: deque[bool]
+    num_timesteps: int
+    _iterations: int
+    _start_timesteps: int
+    _start_time: int
 
     @property
     def _models(self) -> dict[str, BaseAlgorithm]:
@@ -65,11 +79,30 @@ class SB3Protocol:
         """The models by agent."""
         raise NotImplementedError
 
-    _logger: Logger | None
-
     def get_env(self) -> VecEnv | None:
         """Return the team's environment, if it has one."""
-        raise NotImplementedError
+        return None if self._loop is None else self._loop.env
+
+    def set_env(self, env: VecEnv) -> None:
+        """
+        Give the team another environment.
+
+        :param env: Has the same agents, scripted others, spaces and number of copies
+        :raises RuntimeError: If the team is learning
+        :raises ValueError: If the environment does not fit
+        """
+        if self._learning:
+            raise RuntimeError("The environment of a team cannot be changed while it learns.")
+        loop = JointLoop(check_team_vec_env(env))
+        check_same_agents(self.possible_agents, self._scripted, loop.possible_agents, loop.scripted)
+        n_envs = self.n_envs
+        if env.num_envs != n_envs:
+            raise ValueError(
+                f"The team's buffers are for {n_envs} copies, the environment has {env.num_envs}: save the team and use"
+                " Team.load(path, env=env), which makes new ones."
+            )
+        self._agents.move(loop)
+        self._loop = loop
 
     @property
     def logger(self) -> Logger:
@@ -85,6 +118,13 @@ class SB3Protocol:
         :param logger: The new logger
         """
         self._logger = logger
+
+    def dump_logs(self) -> None:
+        """Write the team's table: what has been recorded, and statistics of episodes and time."""
+        self._iterations += 1
+        record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer, self.get_env())
+        record_time(self.logger, self._iterations, self.num_timesteps, self._start_timesteps, self._start_time)
+        self.logger.dump(step=self.num_timesteps)
 
     @property
     def observation_space(self) -> spaces.Dict:

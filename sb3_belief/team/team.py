@@ -20,12 +20,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.common.rng import RngSwitch, global_rngs_of_this_thread
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, env_seed, run_learn, team_rng
-from sb3_belief.team.arguments import as_callback, check_agent_keys, check_same_agents, check_team_vec_env, per_agent
+from sb3_belief.team.arguments import as_callback, check_agent_keys, check_team_vec_env, per_agent
 from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.exact import ExactTraining, check_exact_load
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
-from sb3_belief.team.logs import TeamLog, record_statistics, record_time
+from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.masks import MaskCheck
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
@@ -178,8 +178,8 @@ class Team(SB3Protocol):
         :return: The team
         :raises RuntimeError: If the team is learning already, or if another does in another thread
         :raises ValueError: If it has no environment, if agents are unknown, if the run has another name already, if something
-            was set on the team that belongs to its models, if the ``EvalCallback`` of an agent has another's environment, or if
-            a team that was loaded to go on exactly is to begin anew
+            was set on the team that belongs to its models, if the ``EvalCallback`` of an agent has another's environment, or
+            if a team that was loaded to go on exactly is to begin anew
         """
         if self._learning:
             raise RuntimeError("This team is learning already: learn() cannot be called by a callback or an agent of its own.")
@@ -327,9 +327,9 @@ class Team(SB3Protocol):
         :param tensorboard_log: As in the constructor
         :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
         :param jobs: As in the constructor
-        :param exact: Whether the next ``learn(..., reset_num_timesteps=False)`` goes on bit for bit where the team was saved with
-            ``exact=True``: episodes, random numbers, buffers, logs, and callbacks if the same ones are given in the same order.
-            Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
+        :param exact: Whether the next ``learn(..., reset_num_timesteps=False)`` goes on bit for bit where the team was saved
+            with ``exact=True``: episodes, random numbers, buffers, logs, and callbacks if the same ones are given in the same
+            order. Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
         :param trust_pickle: Whether to read pickles (older files, functions), which can run any code of whoever made the file
         :param allow_packages: Packages of your own of which the file may name classes and functions
         :param kwargs: Arguments of the algorithms that replace the saved ones (``learning_rate=1e-5``), and ``seed``, which
@@ -368,38 +368,6 @@ class Team(SB3Protocol):
     def monitor_state(self) -> dict[str, Any] | None:
         """How far the monitor files were when the team was saved, for ``start_monitor``; until the team learns."""
         return self._exact.monitor_state
-
-    def get_env(self) -> VecEnv | None:
-        """Return the team's environment, if it has one."""
-        return None if self._loop is None else self._loop.env
-
-    def set_env(self, env: VecEnv) -> None:
-        """
-        Give the team another environment.
-
-        :param env: Has the same agents, scripted others, spaces and number of copies
-        :raises RuntimeError: If the team is learning
-        :raises ValueError: If the environment does not fit
-        """
-        if self._learning:
-            raise RuntimeError("The environment of a team cannot be changed while it learns.")
-        loop = JointLoop(check_team_vec_env(env))
-        check_same_agents(self.possible_agents, self._scripted, loop.possible_agents, loop.scripted)
-        n_envs = self.n_envs
-        if env.num_envs != n_envs:
-            raise ValueError(
-                f"The team's buffers are for {n_envs} copies, the environment has {env.num_envs}: save the team and use"
-                " Team.load(path, env=env), which makes new ones."
-            )
-        self._agents.move(loop)
-        self._loop = loop
-
-    def dump_logs(self) -> None:
-        """Write the team's table: what has been recorded, and statistics of episodes and time."""
-        self._iterations += 1
-        record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer, self.get_env())
-        record_time(self.logger, self._iterations, self.num_timesteps, self._start_timesteps, self._start_time)
-        self.logger.dump(step=self.num_timesteps)
 
     def _make_log(self, run_name: str | None) -> TeamLog:
         if self._log is None:

@@ -120,8 +120,8 @@ class CopyState:
         if saved["objects"].keys() != self._objects.keys():
             other = sorted(saved["objects"].keys() ^ self._objects.keys())
             raise ValueError(
-                f"The saved state is of an environment with other parts, {other[:3]}: make it with the same arguments, and of the"
-                " same version."
+                f"The saved state is of an environment with other parts, {other[:3]}: make it with the same arguments, and of"
+                " the same version."
             )
         for path, attributes in saved["objects"].items():
             if isinstance(attributes, dict):

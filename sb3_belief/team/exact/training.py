@@ -59,8 +59,8 @@ def check_exact_load(env: Any, settings: Mapping[str, Any]) -> None:
         raise ValueError("A training goes on in an environment: Team.load(path, env=env, exact=True), made as it was before.")
     if settings:
         raise ValueError(
-            f"A training that goes on exactly keeps its settings, but load() was given {sorted(settings)}: leave them out, or load"
-            " the team without exact=True."
+            f"A training that goes on exactly keeps its settings, but load() was given {sorted(settings)}: leave them out, or"
+            " load the team without exact=True."
         )
 
 
@@ -173,7 +173,8 @@ class ExactTraining:
         state = decode(parts[_TEAM], lambda module: module.partition(".")[0] in PACKAGES, "the exact state of the team")
         if state["n_envs"] != loop.num_envs:
             raise ValueError(
-                f"The exact state is of {state['n_envs']} copies of the environment, which now has {loop.num_envs}: give as many."
+                f"The exact state is of {state['n_envs']} copies of the environment, which now has {loop.num_envs}: give as"
+                " many."
             )
         self._pending, self._pending_agents = state, {agent: parts[name] for agent, name in names.items()}
         for name, value in state["counters"].items():

@@ -23,8 +23,8 @@ from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.vec_env.agent_vec_env import AgentStep, AgentTransition, AgentVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamObs
 
-# Why an agent's coroutine has switched to the scheduler: it is to begin a rollout, has chosen its actions, counted a step, or ended
-# a rollout
+# Why an agent's coroutine has switched to the scheduler: it is to begin a rollout, has chosen its actions, counted a step, or
+# ended a rollout
 ROLLOUT_STARTS, ACTS, COUNTED, ROLLOUT_ENDED, FINISHED = "rollout starts", "acts", "counted", "rollout ended", "finished"
 # Its policy waits for those of other agents, to make their forward passes in one batch
 BATCHES_FORWARD = "batches forward"

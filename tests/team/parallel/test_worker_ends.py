@@ -57,7 +57,7 @@ def failing(what, at=2, **kwargs):
 def test_agents_that_are_behind_are_named_and_not_saved(tmp_path):
     team = failing("kill")
     before = parameters(team.agents["agent_0"])
-    with pytest.raises(WorkerError, match="process 0 .* died while it was busy with agent_0") as caught:
+    with pytest.raises(WorkerError, match=r"process 0 .* died while it was busy with agent_0") as caught:
         team.learn(64)
     said = "as they were before are 'agent_0' at step 0; as far as they came are 'agent_1' at step 32"
     assert said in notes(caught.value)
