@@ -46,6 +46,43 @@ class _LatestValues(KVWriter):
         """Do nothing: no file is open."""
 
 
+class _Iterations(KVWriter):
+    """
+    Writer that corrects an agent's number of iterations for those that come after it, where a training has been continued.
+
+    SB3 counts them from one in each ``learn()``.
+    """
+
+    _KEY = "time/iterations"
+
+    def __init__(self) -> None:
+        self._before, self._counted = 0, 0
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        if self._KEY in key_values:
+            if key_values[self._KEY] <= self._counted:
+                # A further learn()
+                self._before = 0
+            self._counted = key_values[self._KEY]
+            key_values[self._KEY] += self._before
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+    @property
+    def shown(self) -> int:
+        """The number that was written last."""
+        return self._before + self._counted
+
+    def go_on_from(self, shown: int) -> None:
+        """
+        Count on.
+
+        :param shown: The number that was written last
+        """
+        self._before, self._counted = shown, 0
+
+
 class TeamLog:
     """
     The loggers of a team and of its agents.
@@ -97,6 +134,7 @@ class TeamLog:
         self.team_logger = logger(before.get("team_table"))
         # Those that the models use, which the user may have set
         self._used = dict(self.agent_loggers)
+        self._iterations: dict[str, _Iterations] = {}
         if verbose >= 1:
             # Longer keys than SB3's own: it refuses two that are equal when they are cut
             self.team_logger.output_formats.append(HumanOutputFormat(sys.stdout, max_length=100))
@@ -112,6 +150,8 @@ class TeamLog:
         """
         if not model._custom_logger:
             model.set_logger(self.agent_loggers[agent])
+        self._iterations[agent] = _Iterations()
+        model.logger.output_formats.insert(0, self._iterations[agent])
         model.logger.output_formats.append(_LatestValues(agent, self))
         self._algorithms[agent] = type(model).__name__
         self._used[agent] = model.logger
@@ -136,8 +176,9 @@ class TeamLog:
         """
         values: dict[str, list[float]] = {}
         keys: dict[str, str] = {}
-        for agent, dumped in self.latest.items():
-            for key, value in dumped.items():
+        # In the order of the team, and not of who was first, on which the last bits of a mean would depend
+        for agent in filter(self.latest.__contains__, self.agent_loggers):
+            for key, value in self.latest[agent].items():
                 # The team records times itself; images, texts and the like are only in the agents' own logs
                 if isinstance(value, (Number, np.number)) and not key.startswith("time/"):
                     shown = self._shown(agent, key)
@@ -172,6 +213,7 @@ class TeamLog:
             "agent_tables": {agent: table_state(logger) for agent, logger in self.agent_loggers.items()},
             "team_counters": counters(self.team_logger),
             "agent_counters": {agent: counters(logger) for agent, logger in self._used.items()},
+            "iterations": {agent: iterations.shown for agent, iterations in self._iterations.items()},
             # Of which the means will be logged, of nothing else
             "latest": {
                 agent: {key: float(value) for key, value in values.items() if isinstance(value, (Number, np.number))}  # type: ignore[arg-type]
@@ -189,6 +231,8 @@ class TeamLog:
         put_counters_back(self.team_logger, state["team_counters"])
         for agent, logger in self._used.items():
             put_counters_back(logger, state["agent_counters"][agent])
+        for agent, iterations in self._iterations.items():
+            iterations.go_on_from(state["iterations"][agent])
         self.latest.clear()
         self.latest.update({agent: dict(values) for agent, values in state["latest"].items()})
         self.excluded.update({key: tuple(outputs) for key, outputs in state["excluded"].items()})

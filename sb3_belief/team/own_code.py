@@ -6,8 +6,8 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 
-# Callbacks of these libraries use a model only to predict and to save it
-_LIBRARIES = {"stable_baselines3", "sb3_contrib"}
+# Callbacks of these libraries, and our own, use a model only to predict and to save it
+_LIBRARIES = {"stable_baselines3", "sb3_contrib", __name__.partition(".")[0]}
 
 
 def callbacks_within(callback: BaseCallback | None) -> Iterator[BaseCallback]:
@@ -31,7 +31,7 @@ def callbacks_within(callback: BaseCallback | None) -> Iterator[BaseCallback]:
 
 def is_of_a_library(callback: BaseCallback) -> bool:
     """
-    Tell whether a callback is one of SB3 or sb3-contrib.
+    Tell whether a callback is one of SB3, sb3-contrib or this package.
 
     :param callback: The callback
     """
@@ -40,8 +40,8 @@ def is_of_a_library(callback: BaseCallback) -> bool:
 
 def find_own_callback(callback: BaseCallback | None) -> Any:
     """
-    Find what a team's callback calls besides the callbacks of SB3 and sb3-contrib. Those use the models through the team's own
-    methods only, and change nothing in them.
+    Find what a team's callback calls besides the callbacks of SB3, sb3-contrib and this package. Those use the models through
+    the team's own methods only, and change nothing in them.
 
     :param callback: Of a team
     :return: The first callback or function of the user's own; None without one
@@ -61,6 +61,5 @@ def runs_own_code(callbacks: Iterable[BaseCallback | None], models: Mapping[str,
     :param models: The models that act, by agent
     :return: True for a callback or an algorithm that is not from SB3, sb3-contrib or this package
     """
-    known = {*_LIBRARIES, __name__.partition(".")[0]}
-    own = [m for m in models.values() if type(m).__module__.partition(".")[0] not in known]
+    own = [m for m in models.values() if type(m).__module__.partition(".")[0] not in _LIBRARIES]
     return any(find_own_callback(callback) is not None for callback in callbacks) or bool(own)

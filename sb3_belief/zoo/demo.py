@@ -58,7 +58,7 @@ def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: l
     :param seed: Seed of the team and its environments
     :param log_folder: Folder of all runs
     :param command: The words of the command line, recorded in ``run.json``
-    :return: Exit status: 0, or 130 after Ctrl-C
+    :return: Exit status: 0, or that of the signal that ended the training (130 after Ctrl-C)
     """
     console = Console()
     config = load_config(ALGO, ENV_ID, n_timesteps=n_timesteps)
@@ -92,7 +92,7 @@ def demo(n_timesteps: int, episodes: int, seed: int, log_folder: str, command: l
     result = train(config, options)
     seconds = time.monotonic() - start
     if not result.finished:
-        return 130
+        return result.exit_status
     with console.status("Measuring the trained team, drawing"):
         rates["after"] = _measure(config, result.team, episodes)
         curve = plot_learning_curve(

@@ -17,6 +17,14 @@ class ConfigError(ValueError):
     """
 
 
+class RunFailed(RuntimeError):
+    """
+    Error for a training that has failed after it had started.
+
+    The message says why, and where the last good state is. The cause (``__cause__``) is what was raised.
+    """
+
+
 def shorten(text: str) -> str:
     """
     Shorten the long lists of numbers in a message, such as the bounds of a space.

@@ -39,6 +39,25 @@ def positive_or_off(text: str) -> int:
     return -1 if text == "-1" else positive_number(text)
 
 
+def duration_or_off(text: str) -> float:
+    """
+    Read how much time lies between two events.
+
+    :param text: The word on the command line: a number of seconds, or with a unit: ``90s``, ``10m``, ``2h``
+    :return: Seconds, or -1 for never
+    """
+    if text == "-1":
+        return -1
+    unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], 0)
+    try:
+        seconds = float(text[:-1]) * unit if unit else float(text)
+        if 0 < seconds <= _MOST:
+            return seconds
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"must be a time such as 90s, 10m or 2h, or -1 for never, not {text[:40]!r}")
+
+
 def seed_number(text: str) -> int:
     """
     Read a seed.

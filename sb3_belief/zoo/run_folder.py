@@ -5,7 +5,9 @@ import os
 import platform
 import re
 import shlex
+import sys
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -14,8 +16,11 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_belief.common.durable_files import replaced_file
 from sb3_belief.common.versions import versions
 from sb3_belief.envs.suites import SUITES, comma_separated
+from sb3_belief.team.checkpoints import checkpoint_files
+from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short
 from sb3_belief.zoo.names import get_algo, load_env
 
@@ -23,6 +28,12 @@ CONFIG = "config.yml"
 RECORD = "run.json"
 TEAM = "team.zip"
 CHECKPOINTS = "checkpoints"
+# How a run ended that can be continued, by its record
+UNFINISHED = ("running", "interrupted", "failed")
+# Flag of a run that continues training a saved team
+_TRAINED = ("-i", "--trained-agent")
+# Entries of a record that say how the run ended
+_OF_AN_END = ("error", "signal", "timesteps", "seconds", "saved")
 
 
 def make_run_folder(log_folder: str | os.PathLike[str], algo: str, env_id: str) -> Path:
@@ -79,6 +90,17 @@ def remove_run_folder(folder: Path) -> None:
         pass
 
 
+def write_config(folder: Path, config: RunConfig) -> None:
+    """
+    Write the configuration of a run into its folder.
+
+    :param folder: The folder
+    :param config: The configuration
+    """
+    with replaced_file(folder / CONFIG, "w", encoding="utf-8") as file:
+        file.write(config.to_yaml())
+
+
 class RunRecord:
     """
     The file ``run.json``, which records what ran, with which seed, by which command, and how it ended.
@@ -88,20 +110,27 @@ class RunRecord:
 
     :param folder: Folder of the run
     :param command: The words of the command line
+    :param before: The record of the run so far, if it is continued: its entries stay, and what is new comes into a list under
+        ``resumed``
     :param content: Further entries
     """
 
-    def __init__(self, folder: Path, command: list[str], **content: Any) -> None:
+    def __init__(self, folder: Path, command: list[str], before: dict[str, Any] | None = None, **content: Any) -> None:
         self.path = folder / RECORD
-        self._start = time.monotonic()
-        self.content: dict[str, Any] = {
-            "status": "running",
-            **content,
+        self._start, self._seconds = time.monotonic(), 0.0
+        now = {
             "command": shlex.join(command),
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "versions": versions(),
             "platform": platform.platform(),
         }
+        self.content: dict[str, Any] = {"status": "running", **content, **now}
+        if before is not None:
+            seconds = before.get("seconds", 0.0)
+            self._seconds = float(seconds) if isinstance(seconds, int | float) else 0.0
+            kept = {key: value for key, value in before.items() if key not in ("status", *_OF_AN_END)}
+            resumed = [*before.get("resumed", []), {key: value for key, value in now.items() if value != before.get(key)}]
+            self.content = {"status": "running", **kept, **content, "resumed": resumed}
         self._write()
 
     def finish(self, status: str, **content: Any) -> None:
@@ -111,23 +140,24 @@ class RunRecord:
         :param status: ``"finished"``, ``"interrupted"`` or ``"failed"``
         :param content: Results to add
         """
-        self.content.update(status=status, seconds=round(time.monotonic() - self._start, 1), **content)
+        seconds = self._seconds + time.monotonic() - self._start
+        self.content.update(status=status, seconds=round(seconds, 1), **content)
         self._write()
 
     @contextmanager
     def failures(self) -> Iterator[None]:
-        """Record a failure of the lines in the context, whatever it is, and raise it on."""
+        """Record a failure of the lines in the context, unless they have recorded how they ended, and raise it on."""
         try:
             yield
         except BaseException as error:
-            self.finish("failed", error=cause(error))
+            if self.content["status"] == "running":
+                self.finish("failed", error=cause(error))
             raise
 
     def _write(self) -> None:
-        # A program that reads the record meanwhile gets the old or the new one, never a part, because replacing is atomic
-        temporary = self.path.with_suffix(".json.tmp")
-        temporary.write_text(json.dumps(self.content, indent=2) + "\n", encoding="utf-8")
-        temporary.replace(self.path)
+        # A program that reads the record meanwhile gets the old or the new one, never a part
+        with replaced_file(self.path, "w", encoding="utf-8") as file:
+            file.write(json.dumps(self.content, indent=2) + "\n")
 
 
 def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
@@ -152,6 +182,8 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
     """
     Return the path of a saved team.
 
+    Of a run that has not ended, or was killed, it is the newest checkpoint, which is said on the standard error.
+
     :param run: Folder of a run, or zip of a team
     :param flag: Flag or command that it was given to, for the error message
     :return: Path of the zip
@@ -163,12 +195,45 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
     # os.path, because Path.is_dir raises for a name that is too long
     if not os.path.isdir(path):
         raise ConfigError(f"{flag}: no file or folder {str(path)!r}. Give a run's folder or a saved team's zip.")
-    if not (path / TEAM).is_file():
+    is_run = (path / RECORD).is_file()
+    status = read_record(path).get("status") if is_run else None
+    checkpoint = None
+    # An earlier part of a run that goes on may have left a team
+    if is_run and (status == "running" or not (path / TEAM).is_file()):
+        checkpoint = next(whole_checkpoints(path), None)
+    if checkpoint is None and not (path / TEAM).is_file():
         # Not deeper: checkpoints lie one folder below, and the folder may be any
         others = sorted(file.relative_to(path).as_posix() for pattern in ("*.zip", "*/*.zip") for file in path.glob(pattern))
         names = comma_separated(others, most=10) or "it has none"
         raise ConfigError(f"{flag}: no {TEAM} in {str(path)!r}. Give one of its zips: {names}.")
-    return path / TEAM
+    team = path / TEAM if checkpoint is None else checkpoint
+    if status in UNFINISHED:
+        how = f" What -i trains is a new run; train --resume {path} continues this one exactly." if flag in _TRAINED else ""
+        print(f"{path} has not finished ({status}): {team.relative_to(path)} is taken.{how}", file=sys.stderr)
+    return team
+
+
+def whole_checkpoints(folder: Path) -> Iterator[Path]:
+    """
+    Iterate over the checkpoints of a run that are whole, from the newest on. Damaged ones are said on the standard error.
+
+    :param folder: Folder of the run
+    :return: Their paths
+    """
+    for _, path in reversed(checkpoint_files(folder / CHECKPOINTS)):
+        try:
+            # Nothing is unpacked here
+            with zipfile.ZipFile(path) as archive:
+                damaged = archive.testzip()
+                if damaged is None:
+                    archive.getinfo("team.json")
+        # Whatever was made of a file may make zipfile and zlib raise whatever they raise
+        except Exception as error:
+            damaged = cause(error)
+        if damaged is None:
+            yield path
+        else:
+            print(f"{path} is damaged ({damaged}): an earlier checkpoint is looked for.", file=sys.stderr)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -202,13 +267,26 @@ def run_of(team: Path) -> tuple[str, str, Path] | None:
     # Checkpoints lie one folder deeper than the final team
     for folder in list(team.resolve().parents)[:2]:
         if (folder / RECORD).is_file():
-            record = read_record(folder)
-            if not (folder / CONFIG).is_file():
-                continue
-            if not (isinstance(record.get("algo"), str) and isinstance(record.get("env"), str)):
-                raise ConfigError(f"{folder / RECORD}: does not say which 'algo' and 'env' the run had: it is damaged.")
-            return record["algo"], record["env"], folder / CONFIG
+            run = run_of_record(folder, read_record(folder))
+            if run is not None:
+                return run
     return None
+
+
+def run_of_record(folder: Path, record: dict[str, Any]) -> tuple[str, str, Path] | None:
+    """
+    Return what a run's record says of it.
+
+    :param folder: Folder of the run
+    :param record: Its record
+    :return: Algorithm, environment id and configuration file of the run, or None if it has no such file
+    :raises ConfigError: If the record is damaged
+    """
+    if not (folder / CONFIG).is_file():
+        return None
+    if not (isinstance(record.get("algo"), str) and isinstance(record.get("env"), str)):
+        raise ConfigError(f"{folder / RECORD}: does not say which 'algo' and 'env' the run had: it is damaged.")
+    return record["algo"], record["env"], folder / CONFIG
 
 
 def check_record(

@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Video
 
 from sb3_belief.team.log_files import CSVLog, counters, open_logger, put_counters_back
@@ -143,6 +144,31 @@ def test_the_log_of_a_team_goes_on(tmp_path):
             {key: float(text or "nan") for key, text in expected.items()}, nan_ok=True
         )
         assert row["train/loss"] == expected["train/loss"]
+
+
+def test_iterations_are_counted_on(tmp_path):
+    """In SB3 each ``learn()`` counts them from one."""
+
+    def learn(log, *iterations):
+        for i in iterations:
+            model.logger.record("time/iterations", i)
+            model.logger.dump(i)
+
+    model = PPO("MlpPolicy", make_vec_env("CartPole-v1"), n_steps=8, batch_size=8, device="cpu")
+    log = TeamLog(["a"], 0, str(tmp_path), None)
+    log.connect("a", model)
+    learn(log, 1, 2, 3)
+    state = log.state(0)
+    again = TeamLog(["a"], 0, str(tmp_path), None, continue_from=state)
+    model._custom_logger = False
+    again.connect("a", model)
+    again.put_back(state)
+    learn(again, 1, 2)
+    assert again.state(0)["iterations"] == {"a": 5}
+    # A further learn() of the continued team counts anew, as it would without an interruption
+    learn(again, 1, 2)
+    shown = [row["time/iterations"] for row in table(tmp_path / "agents" / "a" / "progress.csv")]
+    assert shown == ["1", "2", "3", "4", "5", "1", "2"]
 
 
 def test_tensorboard_shows_each_step_once(tmp_path):

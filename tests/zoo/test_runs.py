@@ -1,8 +1,6 @@
 import csv
 import json
 import os
-import signal
-import sys
 from importlib import metadata
 
 import numpy as np
@@ -137,49 +135,6 @@ def test_what_does_not_fit_a_saved_team_is_refused(words, message, run, tmp_path
     assert main(["train", "-i", str(run), "--eval-freq", "-1", *words]) == 2
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch, capsys):
-    (tmp_path / "press_ctrl_c.py").write_text(
-        "import os, signal\n"
-        "from stable_baselines3.common.callbacks import BaseCallback\n"
-        "class Press(BaseCallback):\n"
-        "    def _on_step(self):\n"
-        "        if self.num_timesteps == 120:\n"
-        "            os.kill(os.getpid(), signal.SIGINT)\n"
-        "        return True\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    words = ["-n", "800", "--allow-package", "press_ctrl_c", "-params", "callback:press_ctrl_c.Press"]
-    # a process started in the background ignores the signal
-    old = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        status = train_tiny("ppo", tmp_path / "logs", *words)
-    finally:
-        signal.signal(signal.SIGINT, old)
-        sys.modules.pop("press_ctrl_c", None)
-    assert status == 130
-    folder = tmp_path / "logs" / "ppo" / f"{EASY}_1"
-    said = capsys.readouterr().out
-    assert "Interrupted after 120 joint steps" in said and str(folder / "team.zip") in said
-    assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
-    assert Team.load(folder / "team.zip").num_timesteps == 120
-
-
-def test_a_run_that_fails_says_so_in_its_record(tmp_path, monkeypatch):
-    (tmp_path / "break_down.py").write_text(
-        "from stable_baselines3.common.callbacks import BaseCallback\n"
-        "class Break(BaseCallback):\n"
-        "    def _on_step(self):\n"
-        "        raise OSError('disk full')\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(OSError, match="disk full"):
-        train_tiny(
-            "ppo", tmp_path / "logs", "-n", "80", "--allow-package", "break_down", "-params", "callback:break_down.Break"
-        )
-    sys.modules.pop("break_down", None)
-    assert json.loads((tmp_path / "logs" / "ppo" / f"{EASY}_1" / "run.json").read_text())["status"] == "failed"
 
 
 def test_wrappers_change_what_the_agents_see(tmp_path):

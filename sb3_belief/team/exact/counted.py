@@ -27,6 +27,16 @@ def callback_states(callback: BaseCallback | None) -> list[dict[str, Any]]:
     return [{"class": _name(each), "state": _state_of(each)} for each in callbacks_within(callback)]
 
 
+def have_classes(callback: BaseCallback | None, states: list[dict[str, Any]]) -> bool:
+    """
+    Tell whether callbacks are of the same classes as others were, in the same order.
+
+    :param callback: Of a team or an agent
+    :param states: As :func:`callback_states` returned them
+    """
+    return [_name(each) for each in callbacks_within(callback)] == [state["class"] for state in states]
+
+
 def restore_callbacks(callback: BaseCallback | None, states: list[dict[str, Any]], whose: str) -> None:
     """
     Let callbacks go on where others were.

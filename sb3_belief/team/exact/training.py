@@ -19,7 +19,7 @@ from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encod
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.agent_models import AgentModels
 from sb3_belief.team.exact.agent_state import PACKAGES, read_agent_state, write_agent_state
-from sb3_belief.team.exact.counted import callback_states, restore_callbacks, restore_wrappers, wrapper_states
+from sb3_belief.team.exact.counted import callback_states, have_classes, restore_callbacks, restore_wrappers, wrapper_states
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.logs import TeamLog
 
@@ -112,7 +112,7 @@ class ExactTraining:
                 "wrappers": wrapper_states(loop.env),
                 "last": loop.last,
                 "rng": self._rng.get(),
-                "callbacks": callback_states(self._callback) if learning else None,
+                "callbacks": None if self._callback is None else callback_states(self._callback),
                 "agent_callbacks": {agent: callback_states(each) for agent, each in loop.callbacks.items()},
                 "log": None if log is None else log.state(self._team.num_timesteps),
                 "monitor": loop.team_env.monitor_state(),
@@ -248,6 +248,9 @@ class ExactTraining:
         if state["log"] is not None:
             log.put_back(state["log"])
         if not state["in_rollout"]:
+            # Another training, which may have other callbacks
+            if state["callbacks"] is not None and have_classes(self._callback, state["callbacks"]):
+                restore_callbacks(self._callback, state["callbacks"], "the team")
             return
         with loop.put_rngs_aside():
             for agent, model in self._models.items():

@@ -1,0 +1,90 @@
+"""
+A training that is hit at a known moment: ``python interrupted.py MOMENT SIGNAL TIMES words of train.py``.
+
+The signal is sent by the process to itself, so that it comes exactly then. TIMES says how often, 50 ms apart.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+
+from stable_baselines3 import PPO
+
+import sb3_belief.common.durable_files as durable_files
+from sb3_belief.zoo.cli import train_main
+from sb3_belief.zoo.endings import SignalCheck
+from sb3_belief.zoo.seeded_evaluation import SeededEvalCallback
+
+MOMENTS = ("rollout", "update", "evaluation", "checkpoint", "end")
+
+
+def hit(signum, times):
+    for i in range(1, times):
+        threading.Timer(0.05 * i, os.kill, (os.getpid(), signum)).start()
+    os.kill(os.getpid(), signum)
+
+
+def call_before(owner, name, when, action):
+    """Have an action happen once, before the call of a method for which ``when`` is true."""
+    real = getattr(owner, name)
+    done: list = []
+
+    def wrapper(*args, **kwargs):
+        if not done and when(*args, **kwargs):
+            done.append(True)
+            action()
+        return real(*args, **kwargs)
+
+    setattr(owner, name, wrapper)
+
+
+def prepare(moment, action):
+    if moment == "rollout":
+        # In the middle of the third rollout
+        call_before(SignalCheck, "_on_step", lambda self: self.num_timesteps == 200, action)
+    elif moment == "update":
+        # The second agent learns for the third time
+        call_before(PPO, "train", lambda self: self.num_timesteps == 240 and self._n_updates == 2, action)
+    elif moment == "evaluation":
+        call_before(SeededEvalCallback, "_log_success_callback", lambda self, *_: self.num_timesteps == 160, action)
+    elif moment in ("checkpoint", "end"):
+        names: list = []
+        done: list = []
+        real_open, real_fsync = os.open, os.fsync
+
+        def record_open(path, *args, **kwargs):
+            names.append(str(path))
+            return real_open(path, *args, **kwargs)
+
+        def fsync(descriptor):
+            # The file has been written, and is not in its place yet
+            name = "team_160" if moment == "checkpoint" else "/.team.zip"
+            if not done and names[-1:] and ".tmp" in names[-1] and name in names[-1]:
+                done.append(True)
+                action()
+            real_fsync(descriptor)
+
+        durable_files.os.open, durable_files.os.fsync = record_open, fsync
+    else:
+        raise ValueError(moment)
+
+
+def slow_saves(seconds):
+    """Have each save of a file take a while, so that signals come meanwhile."""
+    real = os.fsync
+
+    def fsync(descriptor):
+        time.sleep(seconds)
+        real(descriptor)
+
+    os.fsync = fsync
+
+
+if __name__ == "__main__":
+    moment, name, times, *words = sys.argv[1:]
+    if int(times) > 1:
+        call_before(SignalCheck, "_on_step", lambda self: self.num_timesteps == 164, lambda: slow_saves(0.3))
+    prepare(moment, lambda: hit(getattr(signal, name), int(times)))
+    sys.exit(train_main(words))
