@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, BinaryIO, TypeVar
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -138,6 +139,11 @@ def load_model_zip(
     objects = {**plain_objects(content, where, trust, custom_objects or {}), **(custom_objects or {})}
     try:
         return load(io.BytesIO(content), custom_objects=objects or None, **kwargs)
+    # What settings lead to that no model has: another error would not say that the file is at fault
+    except (LookupError, AttributeError, AssertionError, ArithmeticError, RuntimeError) as error:
+        if isinstance(error, th.cuda.OutOfMemoryError):
+            raise
+        raise ValueError(f"{where} holds no model that can be made: {type(error).__name__}: {error}.") from error
     except Exception as error:
         add_note(error, f"Raised while {where} was loaded.")
         raise
