@@ -11,6 +11,7 @@ from stable_baselines3 import PPO
 
 from sb3_belief import AgentEnv, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.common.file_names import file_name
+from tests.archives import archive_of, changed_json, members_of
 from tests.field.walkers import Walkers, play
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 
@@ -157,8 +158,10 @@ def test_files_with_names_as_they_were(tmp_path):
     env = make_team_env(Named, env_kwargs={"names": ["a:1", "b"]}, seed=0)
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, normalize=True, **PPO_KWARGS)
     team.save(tmp_path / "team.zip")
-    with zipfile.ZipFile(tmp_path / "team.zip") as new, zipfile.ZipFile(tmp_path / "old.zip", "w") as old:
-        for file in new.namelist():
-            old.writestr(file.replace("%3A", ":"), new.read(file))
-        assert "agents/a%3A1.zip" in new.namelist()
-    assert list(Team.load(tmp_path / "old.zip", env=env).agents) == ["a:1", "b"]
+    members = members_of((tmp_path / "team.zip").read_bytes())
+    assert "agents/a%3A1.zip" in members
+    members["team.json"] = changed_json(format=1)(members["team.json"])
+    old = {name.replace("%3A", ":"): each for name, each in members.items() if name.endswith((".zip", ".pkl", "team.json"))}
+    (tmp_path / "old.zip").write_bytes(archive_of(old))
+    loaded = Team.load(tmp_path / "old.zip", env=env, trust_pickle=True)
+    assert list(loaded.agents) == ["a:1", "b"] == list(loaded._agents.statistics)

@@ -56,7 +56,7 @@ def test_a_network_of_ones_own_is_given_features_and_belief_side_by_side(algorit
         # The belief learns through the network, and PPO's ratio starts at one
         assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
     model.save(tmp_path / "model")
-    loaded, rows = algorithm.load(tmp_path / "model"), observations_of(model, 6)
+    loaded, rows = algorithm.load(tmp_path / "model", allow_packages=["tests"]), observations_of(model, 6)
     assert np.array_equal(loaded.predict(rows, deterministic=True)[0], model.predict(rows, deterministic=True)[0])
 
 
@@ -74,7 +74,7 @@ def test_sb3s_own_policy_serves_where_there_is_no_belief(algorithm, policy, tmp_
     pairs = list(zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True))
     assert len(pairs) > 5 and all(th.allclose(a, b, atol=1e-6) for a, b in pairs)
     models[0].save(tmp_path / "model")
-    assert type(algorithm.load(tmp_path / "model").policy) is policy
+    assert type(algorithm.load(tmp_path / "model", allow_packages=["tests"]).policy) is policy
 
 
 @pytest.mark.parametrize("algorithm, policy", STOCK)

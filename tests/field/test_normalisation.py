@@ -144,7 +144,8 @@ def acts_on(monkeypatch, partner):
         return predict(self, obs, *args)
 
     monkeypatch.setattr(PPO, "predict", noted)
-    env = AgentEnv(ToyEnv, "agent_0", {"agent_1": partner})
+    # The files are SB3's own, so they have to be unpickled
+    env = AgentEnv(ToyEnv, "agent_0", {"agent_1": partner}, trust_pickle=True)
     env.reset(seed=0)
     raw = env.parallel_env.observations()["agent_1"]
     env.step(0)
@@ -185,7 +186,9 @@ def test_statistics_that_are_none_are_refused(trained, tmp_path):
     (tmp_path / "text").write_text("hello")
     for wrong, says in ((3, "must be a VecNormalize, the path"), (tmp_path / "text", "must be a VecNormalize, the path")):
         with pytest.raises(TypeError, match=says):
-            AgentEnv(ToyEnv, "agent_0", {"agent_1": (model, wrong)})
+            AgentEnv(ToyEnv, "agent_0", {"agent_1": (model, wrong)}, trust_pickle=True)
+    with pytest.raises(ValueError, match=r"have to be unpickled, and a pickle can run any code .* VecNormalize\.load\(\)"):
+        AgentEnv(ToyEnv, "agent_0", {"agent_1": (model, tmp_path / "text")})
     with pytest.raises(FileNotFoundError):
         AgentEnv(ToyEnv, "agent_0", {"agent_1": (model, folder / "nothing.pkl")})
     other = VecNormalize(make_vec_env("CartPole-v1"))

@@ -130,9 +130,8 @@ def mutated_inside(content: bytes, rng: random.Random, name: str) -> tuple[bytes
     elif kind == 6:
         del members[chosen]
     else:
-        members = {
-            (key + rng.choice(["x", "/../x", "\\x"]) if key == chosen else key): value for key, value in members.items()
-        }
+        other = chosen + rng.choice(["x", "/../x", "\\x"])
+        members = {(other if key == chosen else key): value for key, value in members.items()}
     return archive_of(members, signed=False), chosen
 
 
