@@ -1,5 +1,7 @@
 """Starting, ending and hearing from worker processes, for environment copies and for learning agents alike."""
 
+# What signal itself is made of: signal's functions convert to enumerations, which takes ten times as long as all else they do
+import _signal
 import atexit
 import multiprocessing
 import multiprocessing.connection
@@ -21,7 +23,8 @@ if sys.platform != "win32":
 #: Seconds that a worker gets to finish what it is at before it is killed, and how many times what it took at most so far
 PATIENCE, PATIENCE_FACTOR = 3.0, 3.0
 # Signals that ask a process to end. The main process decides what they mean for its workers
-_END_SIGNALS = ("SIGTERM", "SIGHUP")
+_END_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_ASKING = [int(number) for number in (signal.SIGINT, *_END_SIGNALS)]
 _started: "weakref.WeakSet[Any]" = weakref.WeakSet()
 
 
@@ -83,13 +86,11 @@ def become_worker() -> None:
     it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in _END_SIGNALS:
-        if hasattr(signal, name):
-            number = getattr(signal, name)
-            # Not SIG_IGN: processes that the worker starts would inherit that, and could not be ended by the signal either
-            signal.signal(number, lambda *_: None)
-            if hasattr(signal, "siginterrupt"):
-                signal.siginterrupt(number, False)
+    for number in _END_SIGNALS:
+        # Not SIG_IGN: processes that the worker starts would inherit that, and could not be ended by the signal either
+        signal.signal(number, lambda *_: None)
+        if hasattr(signal, "siginterrupt"):
+            signal.siginterrupt(number, False)
     if hasattr(os, "setpgrp"):
         os.setpgrp()
     _end_with_parent()
@@ -177,15 +178,26 @@ def patience(longest: float) -> float:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block, on systems that can."""
-    if not hasattr(signal, "pthread_sigmask"):
+    """
+    Delay what Ctrl-C and signals that ask to end do until the end of the block.
+
+    A mask would not do: another thread, such as one of PyTorch's, would take the signal, and the main thread act upon it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        # Signals are the main thread's
         yield
         return
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    came: list[tuple[int, Any]] = []
+    handlers = {number: handler for number in _ASKING if callable(handler := _signal.getsignal(number))}
+    for number in handlers:
+        _signal.signal(number, lambda *args: came.append(args))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+        for number, handler in handlers.items():
+            _signal.signal(number, handler)
+        for args in came:
+            handlers[args[0]](*args)
 
 
 class Inbox:

@@ -70,16 +70,23 @@ class WorkerLine:
         Send a command, whose answer is to be taken before the next one.
 
         :param command: Its name
-        :param message: What is sent: bytes as they are, other things as a pickle
+        :param message: What is sent: the bytes of a step, or another thing as a pickle
         :raises OSError: If the worker is dead
         """
-        self._deadline = None if self._limit is None else time.monotonic() + self._limit
-        self._connection.send_bytes(message) if isinstance(message, bytes) else self._connection.send(message)
+        if self.timeout is not None or self._is_new:
+            self._deadline = time.monotonic() + self._limit
+        else:
+            self._deadline = None
+        if command == "step":
+            self._connection.send_bytes(message)
+        else:
+            self._connection.send(message)
         self.pending = command
 
     @property
-    def _limit(self) -> float | None:
-        return max(START_TIMEOUT, self.timeout or 0.0) if self._is_new else self.timeout
+    def _limit(self) -> float:
+        timeout = self.timeout or 0.0
+        return max(START_TIMEOUT, timeout) if self._is_new else timeout
 
     def wait(self) -> bool:
         """
@@ -117,7 +124,7 @@ class WorkerLine:
                 f"Environment worker process {self.copy} (exit code {self.process.exitcode}) died during {doing}()"
             )
         kill_workers([self.process])
-        seconds = "in time" if self._limit is None else f"within {self._limit:g} s"
+        seconds = "in time" if not self._limit else f"within {self._limit:g} s"
         return WorkerTimeoutError(f"Environment worker process {self.copy} did not answer {doing}() {seconds} and was ended")
 
     def drain(self) -> None:

@@ -130,9 +130,11 @@ class WorkersVecEnv(SubprocVecEnv):
         self._check_open("step")
         self._at_fault = set()
         for line, chosen in zip(self._lines, actions, strict=True):
-            # A dead worker is found when its answer is missing
-            with suppress(OSError):
+            try:
                 line.post("step", STEP + pickle.dumps(tuple(chosen.values())))
+            except OSError:
+                # A dead worker is found when its answer is missing
+                continue
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -189,7 +191,8 @@ class WorkersVecEnv(SubprocVecEnv):
     def finish_step(self) -> None:
         """Receive and discard the answers to an interrupted command, if there is one."""
         for line in self._lines:
-            line.drain()
+            if line.pending is not None:
+                line.drain()
 
     def reset(self) -> Any:
         self._check_open("reset")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_belief.common.processes import WorkerError, WorkerTimeoutError
-from sb3_belief.team import make_team_env
+from tests.team.helpers import make_team_env
 from tests.team.toy_envs import MaskedEnv, PartneredEnv, ScriptedEnv, ToyEnv
 from tests.vec_env.faulty_envs import OwnError, Troubled, Troubling
 from tests.vec_env.test_worker_faults import no_test_hangs  # noqa: F401 (a fixture)

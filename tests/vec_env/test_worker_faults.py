@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from sb3_belief.common.processes import WorkerError, WorkerTimeoutError
-from sb3_belief.team import make_team_env
+from tests.team.helpers import make_team_env
 from tests.vec_env import faulty_envs
 from tests.vec_env.faulty_envs import Troubled
 

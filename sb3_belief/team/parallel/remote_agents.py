@@ -9,10 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.common.plain_data import PlainData
+from sb3_belief.common.processes import uninterrupted
 from sb3_belief.common.rng import RngState
 from sb3_belief.common.sent_errors import rebuilt_error
 from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.team.parallel.messages import dumps, loads
+from sb3_belief.team.parallel.messages import Message, dumps, loads
 from sb3_belief.team.parallel.model_state import pack, write_state
 from sb3_belief.team.parallel.worker_server import AgentPayload, Command, state_of, wrappers_of
 from sb3_belief.team.parallel.workers import Workers
@@ -53,6 +54,8 @@ class RemoteAgents:
         # Whether the models are there, whether a command is being carried out, and whether one was since the last sync
         self._is_open, self._is_busy, self._is_stale = False, False, False
         self._answer: dict[str, Any] | None = None
+        # The answer that has been received and not been read yet
+        self._message: Message | None = None
         # Whether the agents have learned since their models were last brought here, and whose models have come back since
         self._has_learned, self._returned = False, set[str]()
 
@@ -65,15 +68,21 @@ class RemoteAgents:
         command = Command(method, args, is_answered)
         # Only models need more than a plain pickle
         message = dumps(command, {}) if method == "open" else command
-        self._workers.send(self._number, message, ", ".join(self.agents))
-        self._is_busy, self._is_stale = is_answered, True
-        if method not in _LEARN_NOTHING:
-            self._has_learned, self._returned = True, set()
+        # A message that is cut off would be the last one
+        with uninterrupted():
+            self._workers.send(self._number, message, ", ".join(self.agents))
+            self._is_busy, self._is_stale = is_answered, True
+            if method not in _LEARN_NOTHING:
+                self._has_learned, self._returned = True, set()
 
     def _receive(self, deadline: float | None = None) -> dict[str, Any]:
         """Return the answer to the last command, after its output, warnings and logs are shown and written here."""
-        answer = loads(self._workers.receive(self._number, deadline))
-        self._is_busy = False
+        if self._is_busy:
+            self._workers.wait(self._number, deadline)
+            with uninterrupted():
+                self._message, self._is_busy = self._workers.receive(self._number), False
+        assert self._message is not None
+        answer, self._message = loads(self._message), None
         if answer["output"]:
             sys.stdout.write(answer["output"])
         for message, category, filename, lineno in answer["warnings"]:
@@ -135,7 +144,7 @@ class RemoteAgents:
 
     def _wait(self, deadline: float | None = None) -> None:
         """Keep the answer to the last command until the loop asks for it."""
-        if self._is_busy:
+        if self._is_busy or self._message is not None:
             self._answer = self._receive(deadline)
 
     def _of_these(self, masks: TeamObs | None) -> TeamObs | None:

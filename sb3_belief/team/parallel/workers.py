@@ -15,7 +15,6 @@ from sb3_belief.common.processes import (
     patience,
     start_context,
     start_worker,
-    uninterrupted,
 )
 from sb3_belief.team.parallel.messages import receive, send
 from sb3_belief.team.parallel.worker_server import serve
@@ -75,8 +74,7 @@ class Workers:
         worker = self._all[number]
         worker.busy_with, worker.asked = agents, time.monotonic()
         try:
-            with uninterrupted():
-                send(worker.connection, content)
+            send(worker.connection, content)
         except OSError as error:
             raise self._death(number) from error
         except BaseException:
@@ -91,13 +89,12 @@ class Workers:
         """
         return time.monotonic() + patience(max((worker.longest or 0.0 for worker in self._all), default=0.0))
 
-    def receive(self, number: int, deadline: float | None = None) -> Any:
+    def wait(self, number: int, deadline: float | None = None) -> None:
         """
         Wait for a worker's answer.
 
         :param number: Number of the worker
         :param deadline: When to give up, by ``time.monotonic()``; None to wait without a limit
-        :return: The answer
         :raises WorkerError: If the worker died, or has not answered by then
         """
         worker = self._all[number]
@@ -112,9 +109,18 @@ class Workers:
                 " and was ended."
             )
         worker.longest = 0.0 if worker.longest is None else max(worker.longest, time.monotonic() - worker.asked)
+
+    def receive(self, number: int) -> Any:
+        """
+        Receive a worker's answer, which is there.
+
+        :param number: Number of the worker
+        :return: The answer
+        :raises WorkerError: If the worker died
+        """
+        worker = self._all[number]
         try:
-            with uninterrupted():
-                return receive(worker.connection)
+            return receive(worker.connection)
         except (EOFError, OSError) as error:
             raise self._death(number) from error
         except BaseException:
