@@ -149,17 +149,20 @@ def join_workers(processes: Iterable[Any], seconds: float) -> None:
     late = []
     for process in processes:
         process.join(max(deadline - time.monotonic(), 0.0))
-        if process.is_alive():
-            late.append(process)
-        else:
+        # Nobody tells of the end of one whose fork server is gone
+        while not is_dead(process) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        if is_dead(process):
             _started.discard(process)
+        else:
+            late.append(process)
     kill_workers(late)
 
 
 def _kill_all(pid: int) -> None:
     # A forked child has a copy of the set, but must not end its parent's workers
     if os.getpid() == pid:
-        kill_workers(process for process in list(_started) if process.is_alive())
+        kill_workers(process for process in list(_started) if not is_dead(process))
 
 
 # multiprocessing asks its processes to end when this one does, and waits for them without a limit. What is registered later

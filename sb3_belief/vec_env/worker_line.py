@@ -239,7 +239,7 @@ def close_lines(lines: Sequence[WorkerLine]) -> list[BaseException]:
         join_workers([line.process for line in told], max(deadline - time.monotonic(), 0.5))
     finally:
         # Whatever has interrupted this
-        kill_workers(line.process for line in lines if line.process.is_alive())
+        kill_workers(line.process for line in lines if not is_dead(line.process))
         for line in lines:
             line.close()
     return errors

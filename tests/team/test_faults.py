@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.toy_envs import FaultyEnv, ToyEnv
+from tests.vec_env.faulty_envs import Troubled
 
 
 @pytest.fixture(autouse=True)
@@ -263,3 +264,34 @@ def test_an_agent_that_will_not_stop():
         team.learn(64, agent_callbacks={"agent_0": Raises(3, ZeroDivisionError())})
     if sys.version_info >= (3, 11):
         assert "'agent_1', stopped because of this, raised RuntimeError" in notes(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_a_team_learns_on_when_a_copy_is_made_anew(vec_env, tmp_path):
+    """Its agents bootstrap where the episode was cut, and the team's log counts it."""
+    maker = partial(Troubled, "step", folder=str(tmp_path), times=2)
+    env = make_team_env(maker, n_envs=2, vec_env=vec_env, restart_workers=2)
+    team, record = make_team(env, log_dir=str(tmp_path)), Record(keep=("dones", "infos"))
+    for model in team.agents.values():
+        model.rollout_buffer.gamma = model.gamma = 0.5
+    with th.no_grad():
+        values = {agent: model.policy.value_net for agent, model in team.agents.items()}
+        for net in values.values():
+            net.weight.zero_()
+            net.bias.fill_(8.0)
+    team.learn(16, callback=record)
+    broken = [kept["infos"][copy] for kept in record.kept for copy in (0, 1) if "worker_restarted" in kept["infos"][copy]]
+    assert len(broken) == 2 and env.n_restarts == 2
+    # No reward, and half of the value of the last observation
+    rewards = [model.rollout_buffer.rewards for model in team.agents.values()]
+    assert all((each == 4.0).sum() == 2 for each in rewards)
+    rows = (tmp_path / "progress.csv").read_text().splitlines()
+    logged = dict(zip(rows[0].split(","), rows[1].split(","), strict=True))
+    assert logged["rollout/worker_restarts"] == "2" and logged["rollout/ep_len_mean"] != ""
+    env.close()
+
+
+def test_no_restarts_are_not_logged(tmp_path):
+    make_team(log_dir=str(tmp_path)).learn(16)
+    assert "restarts" not in (tmp_path / "progress.csv").read_text()

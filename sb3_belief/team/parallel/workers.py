@@ -11,6 +11,7 @@ from sb3_belief.common.processes import (
     Inbox,
     WorkerError,
     WorkerTimeoutError,
+    is_dead,
     kill_workers,
     patience,
     start_context,
@@ -54,7 +55,7 @@ class Workers:
 
         :param n: How many are needed
         """
-        if any(not worker.process.is_alive() for worker in self._all):
+        if any(is_dead(worker.process) for worker in self._all):
             self.end()
         for i in range(len(self._all), n):
             here, there = start_context().Pipe()
