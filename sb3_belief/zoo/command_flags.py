@@ -12,6 +12,7 @@ from sb3_belief.zoo.flag_types import (
     process_number,
     seed_number,
     thread_number,
+    whole_number,
 )
 
 #: Algorithm and environment that are trained if none is given
@@ -112,6 +113,19 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         choices=["dummy", "subproc"],
         default="dummy",
         help="whether environment copies run in this process, or in a worker process each",
+    )
+    parser.add_argument(
+        "--step-timeout",
+        type=duration_or_off,
+        default=-1,
+        help="end a worker process that does not answer a step within this time (90s, 10m); -1 for no limit",
+    )
+    parser.add_argument(
+        "--restart-workers",
+        type=whole_number,
+        default=0,
+        help="how often each copy of the environment is made anew after its process has died or hung, or it has raised an error;"
+        " the broken episode is cut",
     )
     parser.add_argument(
         "--num-threads", type=thread_number, default=1, help="number of torch's threads; -1 for torch's default"

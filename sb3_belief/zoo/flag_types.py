@@ -29,6 +29,16 @@ def positive_number(text: str) -> int:
     return _number(text, 1, _MOST)
 
 
+def whole_number(text: str) -> int:
+    """
+    Read a number that may be 0.
+
+    :param text: The word on the command line
+    :return: The number
+    """
+    return _number(text, 0, _MOST)
+
+
 def positive_or_off(text: str) -> int:
     """
     Read a number of steps between two events.

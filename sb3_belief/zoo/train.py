@@ -106,7 +106,8 @@ def make_envs(config: RunConfig, options: TrainOptions, stack: ExitStack) -> tup
     """
     seed = options.seed
     assert seed is not None
-    env = make_env(config, config.n_envs, seed, options.vec_env)
+    limit = options.step_timeout if options.step_timeout > 0 else None
+    env = make_env(config, config.n_envs, seed, options.vec_env, step_timeout=limit, restart_workers=options.restart_workers)
     stack.callback(env.close)
     config.check_agents(env.possible_agents)
     check_memory(config, env)
@@ -153,11 +154,13 @@ def _check_options(config: RunConfig, options: TrainOptions) -> None:
             check_folder(kwargs["save_path"], f"{config.origin('callback:')}: callback: save_path")
     check_optimizers(config, options.device)
     check_copies(config.n_envs, options.vec_env, config.origin("n_envs"))
+    if options.step_timeout > 0 and options.vec_env != "subproc":
+        raise ConfigError("--step-timeout: an environment in this process cannot be ended while it hangs: --vec-env subproc.")
     if options.eval_freq > 0:
         check_copies(options.n_eval_envs, "dummy", "--n-eval-envs")
 
 
-def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") -> TeamVecEnv:
+def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy", **faults: Any) -> TeamVecEnv:
     """
     Make the environment that a configuration describes.
 
@@ -165,6 +168,7 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") 
     :param n_envs: Number of environment copies
     :param seed: Copy i is seeded with ``seed + i``
     :param vec_env: ``"dummy"`` or ``"subproc"``
+    :param faults: ``step_timeout`` and ``restart_workers``, as for ``make_team_env``
     :return: The environment of the team
     :raises ConfigError: If the environment refuses its settings
     """
@@ -177,6 +181,7 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy") 
             env_kwargs=config.env_kwargs,
             wrapper=config.wrapper,
             visibility=config.visibility,
+            **faults,
         )
     # An environment of the user's own may raise anything, and any settings may be more than the memory holds
     except Exception as error:

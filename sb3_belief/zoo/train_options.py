@@ -29,6 +29,8 @@ class TrainOptions:
     :param save_freq: Number of joint steps between checkpoints, -1 for none by steps
     :param save_every: Seconds between checkpoints, -1 for none by time
     :param vec_env: ``"dummy"`` to step all environment copies in this process, ``"subproc"`` for a worker process per copy
+    :param step_timeout: Seconds within which a worker process must answer, -1 for no limit
+    :param restart_workers: How often each copy of the environment is made anew after a fault
     :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     :param num_threads: Number of torch's threads, -1 for torch's default
     :param jobs: Number of processes, the main one included, in which the agents with on-policy algorithms learn. Each agent
@@ -50,6 +52,8 @@ class TrainOptions:
     save_freq: int = -1
     save_every: float = 600.0
     vec_env: str = "dummy"
+    step_timeout: float = -1.0
+    restart_workers: int = 0
     device: str = "auto"
     num_threads: int = 1
     jobs: int = 1

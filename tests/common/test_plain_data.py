@@ -179,7 +179,7 @@ def test_what_holds_itself_does_so_again():
     cycle.append({"me": cycle})
     back = round_trip(cycle)
     assert back[0]["me"] is back
-    node = Node()
+    node: Any = Node()
     node.others, node.pair = [node], (node, [node])
     back = round_trip(node)
     assert back.others[0] is back and back.pair[0] is back and back.pair[1][0] is back
@@ -193,13 +193,13 @@ def test_what_holds_itself_does_so_again():
 
 def test_objects_are_rebuilt_without_their_constructor():
     before = Node.made
-    node = Node(x=[1], y=np.arange(3))
+    node: Any = Node(x=[1], y=np.arange(3))
     back = round_trip(node)
     assert Node.made == before + 1 and back.x == [1] and np.array_equal(back.y, node.y)
 
 
 def test_bound_methods_are_of_the_object_that_came_back():
-    node = Node()
+    node: Any = Node()
     node.callback = node.chase
     back = round_trip(node)
     assert back.callback.__self__ is back and back.callback() == "chasing"

@@ -79,6 +79,7 @@ class ExactTraining:
         self._pending_agents: dict[str, PlainData] = {}
         self._callback: BaseCallback | None = None
         self._warned = False
+        self._needs_reset: bool | None = None
 
     # Reading
 
@@ -146,11 +147,13 @@ class ExactTraining:
 
         :param loop: The team's loop, after a reset
         """
-        try:
-            encode(loop.team_env.exact_state(), lambda module: True)
-        except NotPlainError:
-            return True
-        return False
+        if self._needs_reset is None:
+            try:
+                encode(loop.team_env.exact_state(), lambda module: True)
+                self._needs_reset = False
+            except NotPlainError:
+                self._needs_reset = True
+        return self._needs_reset
 
     # Going on
 
@@ -217,7 +220,7 @@ class ExactTraining:
         :param rngs: Lends the global random number generators
         :return: Whether there was a state to go on from
         """
-        self._callback = callback
+        self._callback, self._needs_reset = callback, None
         state = self._pending
         if state is None:
             return False

@@ -35,6 +35,8 @@ class SaveOnce(BaseCallback):
     :param at: The step
     """
 
+    model: Any
+
     def __init__(self, at: int | None = None):
         super().__init__()
         self.at, self.saved, self.drawn = at, b"", 0.0
@@ -99,9 +101,9 @@ def make(case, jobs=1, vec_env="dummy"):
     return Team(algo, policy, env, seed=0, jobs=jobs, **kwargs)
 
 
-def everything(team) -> dict[str, Any]:
+def everything(team) -> dict[Any, Any]:
     """Return what a training has ended with."""
-    found: dict[str, Any] = {"steps": team.num_timesteps, "successes": list(team.ep_success_buffer)}
+    found: dict[Any, Any] = {"steps": team.num_timesteps, "successes": list(team.ep_success_buffer)}
     found["episodes"] = [(episode["r"], episode["l"]) for episode in team.ep_info_buffer]
     for agent, model in team.agents.items():
         found[agent, "weights"] = {name: value.numpy().tobytes() for name, value in model.policy.state_dict().items()}
@@ -281,6 +283,8 @@ def test_it_takes_the_first_boundary_of_mixed_rollouts():
     team = Team(PPO, "MlpPolicy", env, seed=0, device="cpu", n_epochs=1, agent_kwargs=agent_kwargs)
 
     class WhereItCan(BaseCallback):
+        model: Any
+
         def __init__(self):
             super().__init__()
             self.at: list[int] = []
