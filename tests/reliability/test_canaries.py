@@ -201,7 +201,7 @@ def test_names_of_what_could_do_something_are_refused(name, run, tmp_path):
             with pytest.raises(ValueError, match=rf"agent 'follower', member 'sb3_belief.json', entry '{key}'"):
                 load_changed(tmp_path, content)
     statistics = changed("agents/follower.vecnormalize.json", lambda _: json.dumps(owner).encode())(whole)
-    with pytest.raises(ValueError, match="agent 'follower', member 'agents/follower.vecnormalize.json'"):
+    with pytest.raises(ValueError, match=r"agent 'follower', member 'agents/follower\.vecnormalize\.json'"):
         load_changed(tmp_path, statistics)
 
 

@@ -23,6 +23,7 @@ from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.plain_data.kinds import name_of
 from sb3_belief.common.safe_files.archive import SUMS, add_members, from_json, names_in, read_archive, to_json
+from sb3_belief.common.safe_files.sizes import check_sizes
 from sb3_belief.common.safe_files.tensors import check_tensors
 from sb3_belief.common.safe_files.trust import PICKLE, Trust
 
@@ -61,7 +62,7 @@ def add_plain_data(file: BinaryIO, model: BaseAlgorithm) -> None:
     entries: dict[str, Any] = {}
     pickled: dict[str, str] = {}
     blobs = []
-    for key in _pickled_keys(_member(file, "data")):
+    for key in _pickled_keys(_settings(_member(file, "data"))):
         try:
             # Whoever reads decides what it may name
             data = encode(vars(model)[key], lambda module: True, key)
@@ -140,7 +141,7 @@ def load_model_zip(
     try:
         return load(io.BytesIO(content), custom_objects=objects or None, **kwargs)
     # What settings lead to that no model has: another error would not say that the file is at fault
-    except (LookupError, AttributeError, AssertionError, ArithmeticError, RuntimeError) as error:
+    except (LookupError, AttributeError, AssertionError, ArithmeticError, RuntimeError, MemoryError) as error:
         if isinstance(error, th.cuda.OutOfMemoryError):
             raise
         raise ValueError(f"{where} holds no model that can be made: {type(error).__name__}: {error}.") from error
@@ -179,11 +180,18 @@ def plain_objects(content: bytes, where: str, trust: Trust, given: Mapping[str, 
             end = position + entry["size"]
             if end < position:
                 raise ValueError("its size is negative.")
-            data, position = PlainData(entry["tree"], members[ARRAYS][position:end]), end
+            described, position = PlainData(entry["tree"], members[ARRAYS][position:end]), end
             if key not in given:
-                objects[key] = decode(data, trust.allowed, key, trust.accepts)
+                objects[key] = decode(described, trust.allowed, key, trust.accepts)
                 _check_entry(key, objects[key])
-    for key in _pickled_keys(members["data"], where, len(content)):
+                check_sizes({key: objects[key]}, len(content))
+    data = _settings(members["data"], where, len(content))
+    if "env" in data and "env" not in given:
+        # Stable-Baselines3 would make an environment of that name, importing what the name says
+        raise ValueError(f"{where}, member 'data': it holds an environment, which is not loaded from a file.")
+    with _named(where, "policy_kwargs", trust):
+        check_sizes(data, len(content))
+    for key in _pickled_keys(data):
         if key not in objects and key not in given:
             reason = str(about["pickled"].get(key, f"{ENTRIES} does not have it"))
             raise ValueError(
@@ -241,14 +249,15 @@ def _about(members: Mapping[str, bytes], where: str, size: int) -> dict[str, Any
     return about
 
 
-def _pickled_keys(data: bytes, where: str = "The zip", size: int = 2**62) -> list[str]:
+def _settings(data: bytes, where: str = "The zip", size: int = 2**62) -> dict[str, Any]:
     found = from_json(data, f"{where}, member 'data'", size)
     if not isinstance(found, dict):
         raise ValueError(f"{where}, member 'data': it is no mapping.")
-    if "env" in found:
-        # Stable-Baselines3 would make an environment of that name, importing what the name says
-        raise ValueError(f"{where}, member 'data': it holds an environment, which is not loaded from a file.")
-    return [key for key, value in found.items() if isinstance(value, dict) and _PICKLED in value]
+    return found
+
+
+def _pickled_keys(settings: dict[str, Any]) -> list[str]:
+    return [key for key, value in settings.items() if isinstance(value, dict) and _PICKLED in value]
 
 
 def _member(file: BinaryIO, name: str) -> bytes:
