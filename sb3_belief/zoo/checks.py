@@ -65,18 +65,30 @@ def check_run_file(function: Callable[..., Any], arguments: Mapping[str, Any], l
     """
     if location.run_folder is None or is_allowed(function.__module__, location.extra_packages):
         return
-    folder = location.run_folder.resolve()
     is_callback = inspect.isclass(function) and issubclass(function, BaseCallback)
     if not is_callback and not is_allowed(function.__module__, ("sb3_belief", "supersuit", "pettingzoo")):
         raise ConfigError(
             f"{location.text}: {function.__module__}.{function.__name__} is no wrapper of a team's environment, and the file"
             " of a run may name no other function. If you trust it: --trust."
         )
+    check_paths(arguments, location)
+
+
+def check_paths(arguments: Mapping[str, Any], location: Location) -> None:
+    """
+    Check that arguments in the configuration of another's run name no place outside of the run's folder to write to.
+
+    :param arguments: The arguments
+    :param location: Where they are given
+    :raises ConfigError: If one does
+    """
+    if location.run_folder is None:
+        return
     for name, value in arguments.items():
         if not isinstance(value, str) or not _PATH.search(name):
             continue
         # Joined to a folder an absolute path remains what it is
-        if not (Path.cwd() / value).resolve().is_relative_to(folder):
+        if not (Path.cwd() / value).resolve().is_relative_to(location.run_folder.resolve()):
             raise ConfigError(
                 f"{location.text}: {name}: {short(value)} lies outside of the run's folder {str(location.run_folder)!r}, where"
                 " the file of a run may not write. If you trust it: --trust, or give your own file with --conf-file."

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_run_file, check_value
+from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, check_paths, check_run_file, check_value
 from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.limits import check_limits
 from sb3_belief.zoo.names import Algo, resolve
@@ -135,6 +135,7 @@ class SettingsChecker:
         if key == "normalize" and isinstance(value, dict):
             return check_call(VecNormalize, value, location, skip=1)
         if key in ("env_kwargs", "eval_env_kwargs"):
+            check_paths(value, location)
             return check_call(self.make_env, value, location, skip=self.n_leading, of_env=True)
         if key == "env_wrapper":
             return tuple(self._check_calls(value, location, skip=1))
