@@ -225,10 +225,8 @@ def _model_zip(model: BaseAlgorithm) -> bytes:
 
 
 def _write_archive(file: Any, members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
-    # Weights hardly shrink, but if the agents' zips were stored as they are, a file cut off after one of them would end as a
-    # complete zip does, and be read by SB3 as the zip of that agent. The rest is stored as it is: what can be unpacked to
-    # a thousand times its size is not to be expected in a team's file
-    write_archive(file, members, lambda name: name.endswith(".zip"))
+    # Weights hardly shrink, and packing them would take as long as all the rest of a save
+    write_archive(file, members, lambda name: name.endswith(".json"))
 
 
 def agent_file(agent: str, names: Collection[str]) -> str:

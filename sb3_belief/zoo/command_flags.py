@@ -124,8 +124,8 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         "--restart-workers",
         type=whole_number,
         default=0,
-        help="how often each copy of the environment is made anew after its process has died or hung, or it has raised an error;"
-        " the broken episode is cut",
+        help="how often each copy of the environment is made anew after its process has died or hung, or it has raised an"
+        " error; the broken episode is cut",
     )
     parser.add_argument(
         "--num-threads", type=thread_number, default=1, help="number of torch's threads; -1 for torch's default"

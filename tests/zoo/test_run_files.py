@@ -40,7 +40,7 @@ def test_environments_that_a_file_may_name(env_id):
     ],
 )
 def test_a_callable_that_is_no_environment_is_for_the_command_line(env_id):
-    with pytest.raises(ConfigError, match="run.json: env: .* is no environment of PettingZoo's kinds.*--allow-package"):
+    with pytest.raises(ConfigError, match=r"run.json: env: .* is no environment of PettingZoo's kinds.*--allow-package"):
         load_env(env_id, "run.json: env", of_file=True)
     assert callable(load_env(env_id, "--env"))
     assert callable(load_env(env_id, "run.json: env", (env_id.partition(".")[0],), of_file=True))

@@ -74,6 +74,9 @@ def names_in(file: BinaryIO, where: str) -> list[str]:
     """
     try:
         with zipfile.ZipFile(file) as archive:
+            if min((each.header_offset for each in archive.infolist()), default=0) != 0:
+                # What is left of a team's file that was cut off may end as the zip of an agent does
+                raise _Unsafe("something is in front of its members, as in a file that was cut off")
             return archive.namelist()
     # A damaged file makes zipfile raise whatever its numbers lead to
     except Exception as error:
