@@ -45,15 +45,14 @@ def restore_callbacks(callback: BaseCallback | None, states: list[dict[str, Any]
     :param states: As :func:`callback_states` returned them; if they are of other classes, there is a warning and nothing else
     :param whose: Whose callbacks they are, for the warning
     """
-    present = list(callbacks_within(callback))
-    names, saved = [_name(each) for each in present], [state["class"] for state in states]
-    if names != saved:
+    if not have_classes(callback, states):
+        names, saved = [_name(each) for each in callbacks_within(callback)], [state["class"] for state in states]
         warnings.warn(
             f"The saved training of {whose} had the callbacks {saved}, now there are {names}: none of them takes over what"
             " was counted and found before. Give the same ones in the same order."
         )
         return
-    for each, state in zip(present, states, strict=True):
+    for each, state in zip(callbacks_within(callback), states, strict=True):
         if hasattr(each, "load_state_dict"):
             each.load_state_dict(state["state"])
             continue

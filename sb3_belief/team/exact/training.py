@@ -25,6 +25,7 @@ from sb3_belief.team.logs import TeamLog
 
 _TEAM = "exact/team"
 _COUNTERS = ("num_timesteps", "_iterations", "ep_info_buffer", "ep_success_buffer")
+_ENTRIES = frozenset("in_rollout n_envs counters env wrappers last rng callbacks agent_callbacks log monitor".split())
 
 
 class ExactState(NamedTuple):
@@ -174,6 +175,8 @@ class ExactTraining:
                 " the training goes on with new episodes and other random numbers."
             )
         state = decode(parts[_TEAM], lambda module: module.partition(".")[0] in PACKAGES, "the exact state of the team")
+        if not (isinstance(state, dict) and state.keys() == _ENTRIES and state["counters"].keys() == set(_COUNTERS)):
+            raise ValueError("The exact state of the team is damaged, or of another version of this package.")
         if state["n_envs"] != loop.num_envs:
             raise ValueError(
                 f"The exact state is of {state['n_envs']} copies of the environment, which now has {loop.num_envs}: give as"
