@@ -124,15 +124,33 @@ def test_masks_and_scripted_others_of_the_new_copy(vec_env, tmp_path):
     env.close()
 
 
+class NoChoice(ToyEnv):
+    """Its second agent is never in play, and has masks that allow no action."""
+
+    def infos(self):
+        return {"agent_0": {}, "agent_1": {"action_mask": np.zeros(3, dtype=bool), "active": False}}
+
+
+def test_an_agent_without_a_choice_when_the_step_breaks_off(tmp_path):
+    """Nobody knows whether it would have been in play."""
+    env = make_team_env(partial(Troubling, NoChoice, 1, str(tmp_path)), restart_workers=1)
+    env.reset()
+    actions = {"agent_0": [0], "agent_1": [0]}
+    assert [env.step(actions)[2].tolist() for _ in range(3)] == [[True], [False], [False]]
+
+
 @pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
 def test_no_more_restarts_than_allowed(vec_env, tmp_path):
     """Counted for each copy, over all episodes; then the error is raised as without them."""
     env = flaky(tmp_path, times=None, vec_env=vec_env, restart_workers=2)
     env.reset()
-    for _ in range(2):
+    for n in (1, 2):
         for _ in range(2):
             env.step(ACTIONS)
-        assert env.step(ACTIONS)[2].tolist() == [True, True]
+        obs, _, dones, _ = env.step(ACTIONS)
+        assert dones.tolist() == [True, True]
+        firsts = [ToyEnv().reset(seed=restart_seed(10 + copy, n))[0]["agent_0"].tolist() for copy in (0, 1)]
+        assert obs["agent_0"].tolist() == firsts
     assert env.n_restarts == 4
     for _ in range(2):
         env.step(ACTIONS)

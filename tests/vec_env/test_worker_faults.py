@@ -1,21 +1,26 @@
 """What fails in an environment is told alike in this process and in workers, and a worker that hangs is never waited for."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
 import uuid
 from functools import partial
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sb3_belief.common.processes import WorkerError, WorkerTimeoutError
+from sb3_belief.common.sent_errors import rebuilt_error
+from sb3_belief.vec_env import worker_line, worker_loop
 from tests.team.helpers import make_team_env
+from tests.team.toy_envs import ToyEnv
 from tests.vec_env import faulty_envs
-from tests.vec_env.faulty_envs import Troubled
+from tests.vec_env.faulty_envs import OwnError, Troubled
 
 ACTIONS = {"agent_0": [0, 0], "agent_1": [0, 0]}
 
@@ -161,6 +166,26 @@ def test_errors_that_cannot_be_rebuilt_are_named(fault, kind, message):
     env.close()
 
 
+def test_an_error_is_never_taken_for_a_row():
+    """Rows are known by their length."""
+
+    class Packer:
+        size = 0
+
+        def pack(self, *_):
+            raise OwnError("as long as a row")
+
+    env = make_team_env(ToyEnv).venv.envs[0]
+    env.reset()
+    channel: Any = worker_loop._Channel(Pipe()[0], env)
+    channel._packer = Packer()
+    message = worker_loop.STEP + pickle.dumps((0, 0))
+    Packer.size = len(channel._step(message))
+    answer = channel._step(message)
+    assert len(answer) != Packer.size and answer.endswith(worker_loop.FAILED)
+    assert str(rebuilt_error(pickle.loads(answer))) == "as long as a row"
+
+
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_errors_of_the_users_script_keep_their_class(tmp_path):
     """Classes of a script are another's in a worker, which imports the script under another name."""
@@ -211,8 +236,6 @@ def test_a_slow_start_is_no_fault(monkeypatch):
     env = make_team_env(make, n_envs=2, vec_env="subproc", step_timeout=0.3)
     env.reset()
     env.close()
-    from sb3_belief.vec_env import worker_line
-
     monkeypatch.setattr(worker_line, "START_TIMEOUT", 0.5)
     with pytest.raises(WorkerTimeoutError, match=r"did not answer get_spaces\(\) within 0.5 s"):
         make_team_env(partial(Troubled, "constructor", "hang"), n_envs=2, vec_env="subproc", step_timeout=0.3)
