@@ -21,7 +21,7 @@ if sys.platform != "win32":
     import fcntl
 
 #: Seconds that a worker gets to finish what it is at before it is killed, and how many times what it took at most so far
-PATIENCE, PATIENCE_FACTOR = 3.0, 3.0
+PATIENCE, PATIENCE_FACTOR = 2.0, 3.0
 # Signals that ask a process to end. The main process decides what they mean for its workers
 _END_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _ASKING = [int(number) for number in (signal.SIGINT, *_END_SIGNALS)]

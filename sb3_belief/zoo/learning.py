@@ -4,6 +4,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,14 +130,9 @@ def learn_and_save(
     end = _End(team, folder, callbacks.checkpoints, record)
     env = team.get_env()
     assert env is not None
-    try:
-        environment = environment_versions(config.env_id, env)
-    # A broken environment may say anything
-    except Exception:
-        if error is None:
-            raise
-        environment = {}
+    environment: dict[str, str] = {}
     if error is None:
+        environment = environment_versions(config.env_id, env)
         error = end.save_finished(options.save_freq > 0 or options.save_every > 0)
     if error is None:
         end.finish("finished", environment=environment)
@@ -144,6 +140,9 @@ def learn_and_save(
             print(f"Finished after {team.num_timesteps} joint steps. Saved: {end.saved}")
         return TrainResult(folder, team)
     end.save_last()
+    # Only now, since a broken environment may say anything, and may hang
+    with suppress(Exception):
+        environment = environment_versions(config.env_id, env)
     goes_on = ""
     if end.can_continue:
         allowed = f" --allow-package {' '.join(options.extra_packages)}" if options.extra_packages else ""

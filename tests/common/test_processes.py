@@ -146,5 +146,5 @@ def test_workers_live_without_their_fork_server():
 
 
 def test_patience_grows_with_what_took_long():
-    assert patience(0.0) == patience(0.9) == 3.0
+    assert patience(0.0) == patience(0.6) == 2.0
     assert patience(20.0) == 60.0

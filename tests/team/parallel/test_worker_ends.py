@@ -77,7 +77,7 @@ def test_agents_that_are_behind_are_named_and_not_saved(tmp_path):
     # It may begin a new training
     team.learn(32)
     team.save(tmp_path / "team")
-    loaded = Team.load(tmp_path / "team")
+    loaded = Team.load(tmp_path / "team", allow_packages=("tests",))
     assert [model.num_timesteps for model in loaded.agents.values()] == [32, 32]
 
 
@@ -118,7 +118,7 @@ def test_an_update_that_hangs_is_not_waited_for_after_ctrl_c(tmp_path):
     signal.signal(signal.SIGINT, interrupt)
     with pytest.raises(KeyboardInterrupt) as caught:
         team.learn(64)
-    assert time.monotonic() - sent[0] < 4.5
+    assert time.monotonic() - sent[0] < 3.5
     assert no_processes_stay()
     assert "'agent_0' at step 0" in notes(caught.value)
     with pytest.raises(ValueError, match="not equally far"):
@@ -135,12 +135,12 @@ def test_an_update_that_takes_its_time_is_waited_for_after_ctrl_c(tmp_path):
 
 
 def test_how_long_a_worker_is_waited_for():
-    """Thrice as long as it took at most, which is at least three seconds."""
+    """Thrice as long as it took at most, and at least two seconds."""
     team = toy_team(PPO, 2, **SMALL).learn(32)
     (worker,) = team._parallel._workers._all
-    assert 0 < worker.longest < 1
+    assert 0 < worker.longest < 0.6
     now = time.monotonic()
-    assert now + 2.9 < team._parallel._workers.deadline() < now + 3.5
+    assert now + 1.9 < team._parallel._workers.deadline() < now + 2.5
     worker.longest = 20.0
     assert now + 59 < team._parallel._workers.deadline() < now + 61
 
