@@ -203,14 +203,14 @@ def write_team(
     for name, data in parts.items():
         members |= _plain_members(f"parts/{name}", data)
     if isinstance(path, io.BufferedIOBase):
-        _write_archive(path, members)
+        write_archive(path, members)
         return
     target = pathlib.Path(path)
     if target.suffix == "":
         target = target.with_name(f"{target.name}.zip")
     make_folder(target.parent)
     with replaced_file(target) as file:
-        _write_archive(file, members)
+        write_archive(file, members)
 
 
 def _plain_members(name: str, data: PlainData) -> dict[str, bytes | Callable[[], bytes]]:
@@ -222,11 +222,6 @@ def _model_zip(model: BaseAlgorithm) -> bytes:
     model.save(buffer)
     add_plain_data(buffer, model)
     return buffer.getvalue()
-
-
-def _write_archive(file: Any, members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
-    # Weights hardly shrink, and packing them would take as long as all the rest of a save
-    write_archive(file, members, lambda name: name.endswith(".json"))
 
 
 def agent_file(agent: str, names: Collection[str]) -> str:
@@ -268,7 +263,7 @@ def _read_team(file: Any, where: str, trust: Trust) -> SavedTeam:
         raise ValueError(f"{where} is not a saved team, or it is damaged: {error}") from None
     if "team.json" not in names and SUMS not in names:
         hint = " It looks like the zip of a single SB3 model: load it with its own class." if "data" in names else ""
-        raise ValueError(f"{where} is not a saved team: it has no team.json.{hint}")
+        raise ValueError(f"{where} is not a saved team, or it is damaged: it has no team.json.{hint}")
     if SUMS not in names and not trust.trust_pickle:
         raise ValueError(
             f"{where} is of an earlier version of this package, or damaged: it has no member {SUMS!r}. It would have to be"
@@ -281,7 +276,7 @@ def _read_team(file: Any, where: str, trust: Trust) -> SavedTeam:
     members = read_archive(file, where)
     if "team.json" not in members:
         hint = " It is the zip of a single model: load it with its own class." if "data" in names else ""
-        raise ValueError(f"{where} is not a saved team: it has no team.json.{hint}")
+        raise ValueError(f"{where} is not a saved team, or it is damaged: it has no team.json.{hint}")
     manifest = _checked_manifest(members["team.json"], where, size, FORMAT)
     files = {agent: f"agents/{file_name(agent)}" for agent in manifest["agents"]}
     saved = SavedTeam(manifest, {}, {}, where, trust, size=size)

@@ -15,7 +15,7 @@ import pytest
 
 from sb3_belief import BeliefPPO
 from sb3_belief.common.safe_files.models import NamedContent
-from tests.archives import changed, changed_json, members_of
+from tests.archives import changed, changed_json
 from tests.reliability.fuzz import NAME, load_agent, load_team, mutated, saved_files
 from tests.team.helpers import Team
 
@@ -111,10 +111,10 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 @pytest.mark.parametrize(
     ("name", "declared", "says"),
     [
-        ("team.json", 3 * GB, "claim 3,0"),
-        ("team.json", 1000, "the list of members|bytes or more instead of|cannot be read"),
-        ("data", 3 * GB, "claim 3,0"),
-        ("agents/agent_0.zip", 3 * GB, "claim 3,0"),
+        ("team.json", 3 * GB, "is compressed, which this package does not do"),
+        ("team.json", 1000, "is compressed, which this package does not do"),
+        ("data", 3 * GB, "is compressed, which this package does not do"),
+        ("agents/agent_0.zip", 3 * GB, "is compressed, which this package does not do"),
     ],
 )
 def test_three_megabytes_that_unpack_to_three_gigabytes_are_refused(name, declared, says, tmp_path):
@@ -129,15 +129,12 @@ def test_three_megabytes_that_unpack_to_three_gigabytes_are_refused(name, declar
 
 def test_json_that_is_all_brackets_is_refused_before_it_is_read(files, tmp_path):
     team, _ = files
-    content = changed("team.json", lambda _: b"[" + b"[]," * 20_000_000 + b"[]]")(team)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, each in members_of(content).items():
-            archive.writestr(name, each)
-    (tmp_path / "bomb.zip").write_bytes(packed.getvalue())
+    # A list of two bytes takes 60 in memory
+    content = changed("team.json", lambda _: b"[" + b"[]," * 4_000_000 + b"[]]")(team)
+    (tmp_path / "bomb.zip").write_bytes(content)
     *said, memory = in_child("-c", MEASURED, str(tmp_path / "bomb.zip")).splitlines()
-    assert "member 'team.json': it has 40,000,002 parts" in said[0]
-    assert int(memory) < 300_000_000
+    assert "member 'team.json': it has 8,000,002 parts" in said[0]
+    assert int(memory) < 150_000_000
 
 
 BLOCKED = """

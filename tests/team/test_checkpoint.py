@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_belief import BeliefPPO
 from sb3_belief.belief import filled_rows
+from sb3_belief.team.fixed_partners.partners import load_model
 from tests.archives import changed_json, rewrite
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MixedEnv, ToyEnv
@@ -189,6 +190,13 @@ def test_files_that_are_no_team(tmp_path):
             Team.load(tmp_path / name)
     with pytest.raises(ValueError, match="single SB3 model"):
         Team.load(tmp_path / "model.zip")
+    # Cut off where the zip of an agent ends, which is a zip with something in front
+    with zipfile.ZipFile(tmp_path / "team.zip") as archive:
+        second = archive.getinfo("agents/agent_1.zip").header_offset
+    (tmp_path / "cut.zip").write_bytes(whole[:second])
+    for load in (Team.load, BeliefPPO.load, partial(load_model, agent="agent_0")):
+        with pytest.raises(ValueError, match=r"damaged|in front of its members"):
+            load(tmp_path / "cut.zip")
     with pytest.raises(FileNotFoundError):
         Team.load(tmp_path / "nothing")
 

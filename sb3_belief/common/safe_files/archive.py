@@ -1,7 +1,8 @@
 """
 Zips whose members are listed in a last one, ``SHA256SUMS``, with hash, size and name each.
 
-What is read from one is what was written, or a ``ValueError`` names the member. Memory is limited by the size of the file.
+What is read from one is what was written, or a ``ValueError`` names the member. Members are not compressed (weights hardly
+shrink), so that nothing can be unpacked to more than the file itself.
 """
 
 import hashlib
@@ -15,8 +16,6 @@ from typing import Any, BinaryIO
 SUMS = "SHA256SUMS"
 #: Members of an archive, far more than any team has
 _MOST_MEMBERS = 50_000
-#: What all members may take together: this, or so many times the size of the file, if that is more
-_LEAST_LIMIT, _RATIO = 64 * 2**20, 100
 _CHUNK = 2**20
 # Numbers, texts and containers in a JSON text: so many, and one more for each two bytes of the file
 _LEAST_PARTS = 500_000
@@ -26,20 +25,18 @@ class _Unsafe(Exception):
     """Raised for what makes an archive unreadable: the member and the reason."""
 
 
-def write_archive(file: BinaryIO, members: Mapping[str, bytes | Callable[[], bytes]], packed: Callable[[str], bool]) -> None:
+def write_archive(file: BinaryIO, members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
     """
     Write an archive, with the list of its members at the end.
 
     :param file: Open binary file
     :param members: Contents of the members, or functions that return them when they are written, by name
-    :param packed: Whether a member of that name is compressed; what is not can be read with no more memory than it takes here
     """
     with zipfile.ZipFile(file, "w") as archive:
         lines = []
         for name, given in members.items():
             content = given() if callable(given) else given
-            kind = zipfile.ZIP_DEFLATED if packed(name) else zipfile.ZIP_STORED
-            archive.writestr(name, content, kind, 1)
+            archive.writestr(name, content)
             lines.append(_line(name, content))
         archive.writestr(SUMS, "".join(lines))
 
@@ -130,13 +127,11 @@ def _check_directory(archive: zipfile.ZipFile, size: int, file: BinaryIO) -> dic
         check_name(each.filename)
         if each.orig_filename != each.filename or each.flag_bits & ~(0x800 | 0x8):
             raise _Unsafe(f"{each.filename[:100]!r} is encrypted, or of another unusual kind")
-        if each.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise _Unsafe(f"{each.filename[:100]!r} is compressed in another way than this package does")
-        if each.compress_type == zipfile.ZIP_STORED and each.compress_size != each.file_size:
-            raise _Unsafe(f"{each.filename[:100]!r} has two sizes")
-    total, most = sum(each.file_size for each in infos), max(_LEAST_LIMIT, _RATIO * size)
-    if total > most:
-        raise _Unsafe(f"the members claim {total:,} bytes, more than a file of {size:,} may hold ({most:,})")
+        if each.compress_type != zipfile.ZIP_STORED or each.compress_size != each.file_size:
+            raise _Unsafe(f"{each.filename[:100]!r} is compressed, which this package does not do")
+    total = sum(each.file_size for each in infos)
+    if total > size:
+        raise _Unsafe(f"the members claim {total:,} bytes, more than the {size:,} of the file")
     found = {each.filename: each for each in infos}
     if len(found) != len(infos):
         raise _Unsafe("two members have the same name")
