@@ -11,7 +11,7 @@ import json
 import re
 import zipfile
 from collections.abc import Callable, Mapping
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 SUMS = "SHA256SUMS"
 #: Members of an archive, far more than any team has
@@ -25,7 +25,7 @@ class _Unsafe(Exception):
     """Raised for what makes an archive unreadable: the member and the reason."""
 
 
-def write_archive(file: BinaryIO, members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
+def write_archive(file: IO[bytes], members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
     """
     Write an archive, with the list of its members at the end.
 
