@@ -55,6 +55,8 @@ class _Plan:
     :param name_prefix: How their names begin
     :param saved_steps: Timesteps at the last one
     :param saved_at: When it was written, by ``time.monotonic()``
+    :param needs_reset: Whether checkpoints reset the environment, so that they must not depend on the clock; None as long as
+        it is unknown
     :param exact: Whether the team can be saved so that the training goes on exactly
     :param kept: The last good state
     """
@@ -66,22 +68,22 @@ class _Plan:
     name_prefix: str
     saved_steps: int = -1
     saved_at: float = -float("inf")
+    needs_reset: bool | None = None
     exact: bool = True
     kept: _Kept = field(default_factory=_Kept)
 
-    def is_due(self, steps: int, needs_reset: bool) -> bool:
+    def is_due(self, steps: int) -> bool:
         """
         Tell whether a file is to be written.
 
         :param steps: Number of the team's timesteps
-        :param needs_reset: Whether checkpoints reset the environment, so that they must not depend on the clock
         """
         if self.save_freq is None and self.save_every is None:
             return False
-        freq = self.save_freq or (RESET_FREQ if needs_reset else None)
+        freq = self.save_freq or (RESET_FREQ if self.needs_reset else None)
         if freq is not None and steps // freq > self.saved_steps // freq:
             return True
-        if needs_reset:
+        if self.needs_reset:
             return False
         return self.save_every is not None and time.monotonic() - self.saved_at >= self.save_every
 
@@ -146,16 +148,24 @@ class Checkpoints(BaseCallback):
     def _on_rollout_start(self) -> None:
         plan, team = self._plan, self._team
         steps = team.num_timesteps
-        if steps == plan.kept.steps:
+        if steps == plan.kept.steps or not self._all_begin:
             return
-        needs_reset = bool(team.exact_needs_reset)
-        if plan.is_due(steps, needs_reset):
+        if plan.needs_reset is None:
+            # It is found out by trying, which takes time
+            plan.needs_reset = bool(team.exact_needs_reset)
+        if plan.is_due(steps):
             plan.saved_steps = steps
             self._save()
             plan.saved_at = time.monotonic()
         elif time.monotonic() - plan.kept.taken_at >= _RARELY * plan.kept.seconds and self._fits:
             # An exact one would reset the environment
-            self._take(exact=not needs_reset)
+            self._take(exact=not plan.needs_reset)
+
+    @property
+    def _all_begin(self) -> bool:
+        """Whether all agents begin a rollout: with rollouts of several lengths one may be in the middle of it."""
+        loop = self._team._loop
+        return loop is None or loop.begins_rollouts
 
     def _on_step(self) -> bool:
         return True

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -133,7 +134,7 @@ def learn_and_save(
     environment: dict[str, str] = {}
     if error is None:
         environment = environment_versions(config.env_id, env)
-        error = end.save_finished(options.save_freq > 0 or options.save_every > 0)
+        error = end.save_finished(remaining > 0 and (options.save_freq > 0 or options.save_every > 0))
     if error is None:
         end.finish("finished", environment=environment)
         if options.verbose:
@@ -150,7 +151,7 @@ def learn_and_save(
     saved = f"Saved: {end.saved}, which is the state at {end.timesteps} joint steps." if end.saved else "Nothing was saved."
     if isinstance(error, KeyboardInterrupt):
         # Someone may raise it without a signal
-        by = error if isinstance(error, Interrupted) else Interrupted(2)
+        by = error if isinstance(error, Interrupted) else Interrupted(signal.SIGINT)
         end.finish("interrupted", signal=by.signal_name, environment=environment)
         print(f"Interrupted by {by.signal_name} after {team.num_timesteps} joint steps. {saved}{goes_on}")
         return TrainResult(folder, team, by.exit_status)

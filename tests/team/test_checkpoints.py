@@ -26,6 +26,7 @@ class FakeTeam:
         self.error: Exception | None = None
         self.saves: list[tuple[int, bool]] = []
         self.synced: list[str] = []
+        self._loop = SimpleNamespace(begins_rollouts=True)
         self._log = SimpleNamespace(sync=lambda: self.synced.append("log"))
         self.env = SimpleNamespace(unwrapped=SimpleNamespace(sync_monitor=lambda: self.synced.append("monitor")))
 
@@ -214,6 +215,16 @@ def test_a_training_that_goes_on_has_its_state_already(tmp_path, clock):
     assert names(tmp_path) == ["team_300_steps.zip"]
     rollouts(team, callback, 400)
     assert names(tmp_path) == ["team_300_steps.zip", "team_400_steps.zip"]
+
+
+def test_there_is_none_where_an_agent_is_in_the_middle_of_a_rollout(tmp_path, clock):
+    team, callback = start(tmp_path, save_freq=100)
+    rollouts(team, callback, 0)
+    team._loop.begins_rollouts = False
+    rollouts(team, callback, 100)
+    team._loop.begins_rollouts = True
+    rollouts(team, callback, 120)
+    assert names(tmp_path) == ["team_0_steps.zip", "team_120_steps.zip"]
 
 
 def test_a_second_training_counts_anew(tmp_path, clock):

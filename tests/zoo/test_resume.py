@@ -60,6 +60,8 @@ def test_a_killed_run_goes_on_to_the_same_end(tmp_path, undisturbed, moment):
 
 
 VARIANTS = {
+    # The second agent begins a rollout every 120 joint steps, the others every 80
+    "rollouts of two lengths": ["-params", "n_envs:4", "agent_kwargs:{car_1: {n_steps: 30}}"],
     "subproc, jobs, normalize": ["--vec-env", "subproc", "--jobs", "2", "-params", "n_envs:2", "normalize:true"],
     "belief": ["--algo", "belief_ppo", "-params", "n_envs:4", "history_length:40"],
     "mpe": ["--env", "mpe/simple_spread_v3", "-params", "n_envs:4"],
@@ -148,6 +150,16 @@ def test_a_finished_run_says_so_and_can_be_extended(tmp_path, undisturbed, capsy
     check_same_run(short, long)
     assert record_of(short)["total_timesteps"] == 640
     assert yaml.safe_load((short / "config.yml").read_text()) == yaml.safe_load((long / "config.yml").read_text())
+
+
+def test_a_run_that_was_killed_when_all_was_learned_is_finished(tmp_path, undisturbed):
+    run = tmp_path / "run"
+    shutil.copytree(undisturbed, run)
+    (run / "team.zip").unlink()
+    (run / "run.json").write_text(json.dumps({**record_of(run), "status": "running"}))
+    assert train_main(["--resume", str(run)]) == 0
+    assert (record_of(run)["status"], record_of(run)["timesteps"]) == ("finished", TOTAL)
+    check_same_run(run, undisturbed)
 
 
 def test_an_unfinished_run_can_be_extended(tmp_path):
