@@ -311,20 +311,6 @@ def test_an_error_in_a_worker(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:odd", "ignore::RuntimeWarning")
-def test_a_worker_dies(tmp_path):
-    team = toy_team(Odd, 2, env_id=lambda: ToyEnv(3), **PPO_SMALL, agent_kwargs={"agent_0": {"at": 2, "kill": True}})
-    with pytest.raises(RuntimeError, match=r"process 0 .* died while it was busy with agent_0, agent_2"):
-        team.learn(64)
-    assert no_processes_stay()
-    with pytest.raises(ValueError, match="not equally far"):
-        team.save(tmp_path / "mixed")
-    for model in team.agents.values():
-        model.at = None
-    team.learn(16)
-    goes_on(team, tmp_path)
-
-
-@pytest.mark.filterwarnings("ignore:odd", "ignore::RuntimeWarning")
 def test_ctrl_c_while_workers_update(tmp_path):
     # The last of them learns in this process
     team = toy_team(Odd, 2, **PPO_SMALL, agent_kwargs={"agent_1": {"at": 2, "interrupt": True}})

@@ -16,6 +16,7 @@ from sb3_belief.common.processes import WorkerError
 from sb3_belief.team.parallel import workers
 from tests.team.helpers import PPO_KWARGS, Team, parameters
 from tests.team.parallel.test_jobs import no_processes_stay, notes, toy_team
+from tests.team.toy_envs import ToyEnv
 from tests.vec_env.test_worker_faults import (  # noqa: F401 (one is a fixture)
     LINUX,
     gone_within,
@@ -79,6 +80,18 @@ def test_agents_that_are_behind_are_named_and_not_saved(tmp_path):
     team.save(tmp_path / "team")
     loaded = Team.load(tmp_path / "team", allow_packages=("tests",))
     assert [model.num_timesteps for model in loaded.agents.values()] == [32, 32]
+
+
+def test_all_agents_of_a_dead_worker_are_named():
+    team = toy_team(Fails, 2, env_id=three_agents, **SMALL, agent_kwargs={"agent_0": {"at": 2}})
+    with pytest.raises(WorkerError, match=r"process 0 .* died while it was busy with agent_0, agent_2") as caught:
+        team.learn(64)
+    assert "'agent_0' at step 0, 'agent_2' at step 0; as far as they came are 'agent_1' at step 32" in notes(caught.value)
+    assert no_processes_stay()
+
+
+def three_agents():
+    return ToyEnv(3)
 
 
 def test_agents_are_behind_only_since_their_models_were_last_here(tmp_path):
