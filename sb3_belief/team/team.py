@@ -282,8 +282,8 @@ class Team(SB3Protocol):
         :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
         :param exact: Whether to save all that decides how the training goes on, so that ``Team.load(path, env, exact=True)``
             resumes it bit for bit: in the ``_on_rollout_start()`` of a team's callback, or after ``learn()``
-        :raises ValueError: If that is asked for elsewhere, or if a worker process (``jobs``) ended before its agents' models had
-            come back, so that they are behind the others
+        :raises ValueError: If that is asked for elsewhere, or if a worker process (``jobs``) ended before its agents'
+            models had come back, so that they are behind the others
         """
         # First, since an environment without a readable state begins new episodes
         state = self._exact.read(self._loop, self._learning, self._can_continue, self._log) if exact else None
