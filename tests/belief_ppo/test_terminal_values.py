@@ -42,8 +42,9 @@ def test_the_values_are_those_of_one_at_a_time(observation_space, algorithm, bel
         patch.setattr(BeliefPolicyMixin, "attach_terminal_values", lambda *args: None)
         expected, one_by_one, passes_one_by_one = learned(observation_space, algorithm, belief)
     # Convolutions round a batch in another way, of which Adam makes up to whole steps
-    np.testing.assert_allclose(rewards, one_by_one, atol=1e-5, rtol=1e-4)
-    atol = 2e-3 if len(observation_space.shape or ()) == 3 else 1e-5
+    of_images = len(observation_space.shape or ()) == 3
+    np.testing.assert_allclose(rewards, one_by_one, atol=1e-5, rtol=5e-3 if of_images else 1e-4)
+    atol = 2e-3 if of_images else 1e-5
     for name, value in expected.policy.named_parameters():
         th.testing.assert_close(dict(model.policy.named_parameters())[name], value, atol=atol, rtol=1e-4)
     # five ends of all copies in 28 steps, each in one pass instead of four

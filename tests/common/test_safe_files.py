@@ -6,6 +6,7 @@ import io
 import re
 import struct
 import zipfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -220,7 +221,7 @@ def test_what_is_no_tensors_is_refused(content, says):
 def test_a_tensor_may_not_be_larger_than_its_storage():
     program = members_of(TWO)["archive/data.pkl"]
     # The shape is the last tuple of one number before the strides
-    shape = re.search(rb"KM(?=\x85q.K\x01\x85)", program)
+    shape: Any = re.search(rb"KM(?=\x85q.K\x01\x85)", program)
     for size, says in ((78, "of shape \\(78,\\) in a storage of 77 entries"), (10**6, "of shape \\(1000000,\\)")):
         larger = program[: shape.start()] + b"J" + struct.pack("<i", size) + program[shape.end() :]
         with pytest.raises(ValueError, match=says):
@@ -251,6 +252,7 @@ def test_trust_in_packages_of_ones_own():
     assert mine.allowed("tests.x") and not mine.allowed("tests2") and mine.accepts(saved) and not mine.accepts(load_from_pkl)
     everything = Trust.of(True, ())
     assert everything.allowed("os") and everything.accepts(load_from_pkl)
+    wrong: Any
     for wrong in ("tests", [1]):
         with pytest.raises(TypeError, match="must be a list of names of packages"):
             Trust.of(False, wrong)

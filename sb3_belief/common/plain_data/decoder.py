@@ -107,10 +107,9 @@ class _Decoder:
     def _known(self, number: Any, kind: type | None = None) -> Any:
         if type(number) is not int or number not in self._shared:
             raise Misfit(f"it refers to {number!r}, which has not been read")
-        value = self._shared[number]
-        if kind is not None and type(value) is not kind:
+        if kind is not None and type(self._shared[number]) is not kind:
             raise Misfit(f"it refers to {number}, which is another kind")
-        return value
+        return self._shared[number]
 
     def _int(self, value: Any, least: int = 0) -> int:
         if type(value) is not int or value < least:
@@ -118,9 +117,9 @@ class _Decoder:
         return value
 
     def _a(self, kind: type, value: Any) -> Any:
-        if type(value) is not kind:
-            raise Misfit(f"{str(value)[:50]!r} is no {kind.__name__}")
-        return value
+        if type(value) is kind:
+            return value
+        raise Misfit(f"{str(value)[:50]!r} is no {kind.__name__}")
 
     def _shape(self, value: Any) -> tuple[int, ...]:
         if len(self._a(list, value)) > 32:
@@ -232,8 +231,6 @@ class _Decoder:
         if not issubclass(kind, enum.Enum) or data["name"] not in kind.__members__:
             raise Misfit(f"{data['class']} has no member {data['name']!r}")
         return kind.__members__[data["name"]]
-
-    # -- arrays --------------------------------------------------------------------------------------------------------
 
     def _dtype(self, data: dict[str, Any]) -> np.dtype:
         return np.dtype(object) if data["of"] == "O" else kinds.plain_dtype(data["of"])

@@ -25,7 +25,7 @@ class _Unsafe(Exception):
     """Raised for what makes an archive unreadable: the member and the reason."""
 
 
-def write_archive(file: IO[bytes], members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
+def write_archive(file: IO[bytes] | io.BufferedIOBase, members: Mapping[str, bytes | Callable[[], bytes]]) -> None:
     """
     Write an archive, with the list of its members at the end.
 
