@@ -2,9 +2,9 @@
 
 # What signal itself is made of: signal's functions convert to enumerations, which takes ten times as long as all else they do
 import _signal
-import atexit
 import multiprocessing
 import multiprocessing.connection
+import multiprocessing.util
 import os
 import select
 import signal
@@ -26,6 +26,8 @@ PATIENCE, PATIENCE_FACTOR = 2.0, 3.0
 _END_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _ASKING = [int(number) for number in (signal.SIGINT, *_END_SIGNALS)]
 _started: "weakref.WeakSet[Any]" = weakref.WeakSet()
+# Numbers of processes that kill their workers at their end
+_kill_at_exit: set[int] = set()
 
 
 class WorkerError(RuntimeError):
@@ -74,6 +76,7 @@ def start_worker(target: Callable[..., None], args: tuple[Any, ...], name: str |
     process = start_context().Process(target=target, args=args, name=name, daemon=True)
     process.start()
     _started.add(process)
+    _kill_all_at_exit()
     return process
 
 
@@ -159,15 +162,21 @@ def join_workers(processes: Iterable[Any], seconds: float) -> None:
     kill_workers(late)
 
 
-def _kill_all(pid: int) -> None:
-    # A forked child has a copy of the set, but must not end its parent's workers
-    if os.getpid() == pid:
-        kill_workers(process for process in list(_started) if not is_dead(process))
+def _kill_all() -> None:
+    kill_workers(process for process in list(_started) if not is_dead(process))
 
 
-# multiprocessing asks its processes to end when this one does, and waits for them without a limit. What is registered later
-# runs earlier
-atexit.register(_kill_all, os.getpid())
+def _kill_all_at_exit() -> None:
+    """
+    Have all workers killed when this process ends.
+
+    At the end ``multiprocessing`` asks its processes to end, which workers ignore, and waits for them without a limit. Its own
+    finalisers of a priority run before, also in its processes, where functions of ``atexit`` do not run. A forked child, which
+    has a copy of the set, must not end its parent's workers: there they do not run.
+    """
+    if os.getpid() not in _kill_at_exit:
+        _kill_at_exit.add(os.getpid())
+        multiprocessing.util.Finalize(None, _kill_all, exitpriority=100)
 
 
 def patience(longest: float) -> float:

@@ -148,3 +148,33 @@ def test_workers_live_without_their_fork_server():
 def test_patience_grows_with_what_took_long():
     assert patience(0.0) == patience(0.6) == 2.0
     assert patience(20.0) == 60.0
+
+
+@LINUX
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_process_of_multiprocessing_ends_with_workers_that_it_still_holds(method, tmp_path):
+    """It would otherwise ask them to end by a signal that they ignore, and wait for ever."""
+    marker = uuid.uuid4().hex
+    script = f"""
+        import multiprocessing
+        from sb3_belief.common import processes
+        held = []
+        def work(connection):
+            processes.become_worker()
+            connection.send("ready")
+            time.sleep(1000)
+        def train():
+            here, there = multiprocessing.Pipe()
+            held.append(processes.start_worker(work, (there,)))
+            assert here.recv() == "ready"
+        if __name__ == "__main__":
+            process = multiprocessing.get_context("{method}").Process(target=train)
+            process.start()
+            process.join(60)
+            print(process.exitcode, flush=True)
+            process.kill()
+    """
+    process = run_script(script, tmp_path, marker)
+    assert process.communicate(timeout=120)[0] == "0\n"
+    assert process.returncode == 0
+    assert not gone_within(10, marker)
