@@ -51,17 +51,17 @@ _BELIEF = (*_PPO, "history_length:40")
 _REPLAY = ("n_envs:4", "buffer_size:300", "learning_starts:60", "batch_size:16", "policy_kwargs.net_arch:[16,16]")
 EASY, SPREAD, FORAGING = "traffic-junction-easy", "mpe/simple_spread_v3", "lbf/Foraging-2s-5x5-2p-1f-coop-v3"
 _SUBPROC, _TWO_JOBS = ("--vec-env", "subproc"), ("--jobs", "2")
-_FEW = ("n_envs:2", "n_steps:40")
-_GAME = ("n_envs:8", "n_steps:16", "batch_size:64", "n_epochs:2", "policy_kwargs.net_arch:[16]", "history_length:40")
+_FEW = ("n_envs:2", "n_steps:40", *_BELIEF[2:])
+_GAME = ("n_steps:16", "batch_size:32", "n_epochs:2", "policy_kwargs.net_arch:[16]", "history_length:40")
 
 #: BeliefPPO over environments x {dummy, subproc} x jobs {1, 2} x normalize {off, on}: a sample in which each level is met
 BELIEF = {
     "junction, dummy, 1 job": Combination("belief_ppo", EASY, 1600, 160, _BELIEF),
     "junction, subproc, 2 jobs, normalize": Combination(
-        "belief_ppo", EASY, 1600, 160, (*_BELIEF, *_FEW, "normalize:true"), (*_SUBPROC, *_TWO_JOBS)
+        "belief_ppo", EASY, 1600, 160, (*_FEW, "normalize:true"), (*_SUBPROC, *_TWO_JOBS)
     ),
     "spread, subproc, 1 job, normalize": Combination(
-        "belief_ppo", SPREAD, 1600, 80, (*_BELIEF, *_FEW, "normalize:true"), _SUBPROC
+        "belief_ppo", SPREAD, 1600, 80, (*_FEW, "normalize:true"), _SUBPROC
     ),
     "spread, dummy, 2 jobs": Combination("belief_ppo", SPREAD, 1600, 160, _BELIEF, _TWO_JOBS),
     "foraging, dummy, 2 jobs, normalize": Combination(
@@ -69,7 +69,7 @@ BELIEF = {
     ),
     "convention, subproc, 1 job": Combination("belief_ppo", "convention-swap", 3200, 320, (*_GAME, "n_envs:2"), _SUBPROC),
     "convention, dummy, 1 job, normalize": Combination(
-        "belief_ppo", "convention-swap", 5120, 256, (*_GAME, "normalize:true")
+        "belief_ppo", "convention-swap", 5120, 256, (*_GAME, "n_envs:8", "normalize:true")
     ),
 }
 #: Teams of other algorithms

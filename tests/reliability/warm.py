@@ -9,6 +9,7 @@ null while it runs. ``["server"]`` is answered by the number of the process from
 import gc
 import json
 import multiprocessing
+import multiprocessing.util
 import os
 import resource
 import signal
@@ -61,7 +62,7 @@ def _start(words: list[str], output: str, limit: int | None = None) -> int:
         status = 1
         try:
             status = _become(words, output, limit)
-            # As an interpreter's end does: workers are told to end
+            # As at the end of any process of multiprocessing: workers are ended
             multiprocessing.util._exit_function()
         finally:
             sys.stdout.flush()
