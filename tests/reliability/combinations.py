@@ -60,9 +60,7 @@ BELIEF = {
     "junction, subproc, 2 jobs, normalize": Combination(
         "belief_ppo", EASY, 1600, 160, (*_FEW, "normalize:true"), (*_SUBPROC, *_TWO_JOBS)
     ),
-    "spread, subproc, 1 job, normalize": Combination(
-        "belief_ppo", SPREAD, 1600, 80, (*_FEW, "normalize:true"), _SUBPROC
-    ),
+    "spread, subproc, 1 job, normalize": Combination("belief_ppo", SPREAD, 1600, 80, (*_FEW, "normalize:true"), _SUBPROC),
     "spread, dummy, 2 jobs": Combination("belief_ppo", SPREAD, 1600, 160, _BELIEF, _TWO_JOBS),
     "foraging, dummy, 2 jobs, normalize": Combination(
         "belief_ppo", FORAGING, 2400, 80, (*_BELIEF, "normalize:true"), _TWO_JOBS

@@ -21,7 +21,6 @@ WORKERS_NEED = ["sb3_belief.team", "sb3_belief.belief_ppo", "sb3_contrib", "mpe2
 
 
 def _import_all() -> None:
-    import mpe2.simple_spread_v3
     import torch as th
 
     import sb3_belief.belief_ppo
