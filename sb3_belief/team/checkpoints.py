@@ -19,6 +19,8 @@ RESET_FREQ = 50_000
 _RARELY = 100
 # Larger states, such as those with large replay buffers, are not held in memory beside the team
 _MOST_BYTES = 256 * 2**20
+# How many rollouts a checkpoint waits for one that all agents begin together before that is said
+_LONG_WAIT = 20
 _NAME = re.compile(r"_(\d+)_steps\.zip")
 
 
@@ -59,6 +61,8 @@ class _Plan:
         it is unknown
     :param exact: Whether the team can be saved so that the training goes on exactly
     :param kept: The last good state
+    :param kept_exact: The last one from which the training goes on exactly; mostly the same
+    :param skipped: How many rollouts have begun since a file was due, because not all agents began one
     """
 
     folder: Path
@@ -71,6 +75,18 @@ class _Plan:
     needs_reset: bool | None = None
     exact: bool = True
     kept: _Kept = field(default_factory=_Kept)
+    kept_exact: _Kept = field(default_factory=_Kept)
+    skipped: int = 0
+
+    def keep_state(self, kept: _Kept) -> None:
+        """
+        Take a state for the last one.
+
+        :param kept: The state
+        """
+        self.kept = kept
+        if kept.is_exact:
+            self.kept_exact = kept
 
     def is_due(self, steps: int) -> bool:
         """
@@ -100,7 +116,8 @@ class Checkpoints(BaseCallback):
     If the disk is full there is a warning, and the training goes on. Between the files the last state is kept in memory
     (``last``), so seldom that it takes a hundredth of the time at most: a program that is interrupted can write it.
     Environments whose state cannot be saved are reset at each checkpoint, which must then not depend on the clock: without
-    ``save_freq`` there is one every 50,000 joint steps.
+    ``save_freq`` there is one every 50,000 joint steps. Where agents have rollouts of unequal lengths, a checkpoint waits
+    until all of them begin one, and what is kept in memory meanwhile are the models only.
 
     :param folder: Folder of the files ``<name_prefix>_<steps>_steps.zip``
     :param save_freq: Joint steps between checkpoints; None for none by steps
@@ -139,27 +156,42 @@ class Checkpoints(BaseCallback):
         plan, steps = self._plan, self._team.num_timesteps
         if steps < plan.saved_steps:
             # Counted anew
-            plan.saved_steps, plan.saved_at, plan.kept = -1, -float("inf"), _Kept()
+            plan.saved_steps, plan.saved_at = -1, -float("inf")
+            plan.kept = plan.kept_exact = _Kept()
         if path is not None:
             small = path.stat().st_size <= _MOST_BYTES
-            plan.kept = _Kept(steps, path.read_bytes() if small else None, True, time.monotonic(), path=path)
+            plan.keep_state(_Kept(steps, path.read_bytes() if small else None, True, time.monotonic(), path=path))
             plan.saved_steps, plan.saved_at = steps, time.monotonic()
 
     def _on_rollout_start(self) -> None:
         plan, team = self._plan, self._team
         steps = team.num_timesteps
-        if steps == plan.kept.steps or not self._all_begin:
+        if steps == plan.kept.steps:
             return
         if plan.needs_reset is None:
             # It is found out by trying, which takes time
             plan.needs_reset = bool(team.exact_needs_reset)
-        if plan.is_due(steps):
-            plan.saved_steps = steps
+        due, all_begin = plan.is_due(steps), self._all_begin
+        if due and all_begin:
+            plan.saved_steps, plan.skipped = steps, 0
             self._save()
             plan.saved_at = time.monotonic()
-        elif time.monotonic() - plan.kept.taken_at >= _RARELY * plan.kept.seconds and self._fits:
-            # An exact one would reset the environment
-            self._take(exact=not plan.needs_reset)
+            return
+        if due:
+            self._skip()
+        if time.monotonic() - plan.kept.taken_at >= _RARELY * plan.kept.seconds and self._fits:
+            # An exact one would reset the environment, or there is none here
+            self._take(exact=all_begin and not plan.needs_reset)
+
+    def _skip(self) -> None:
+        plan = self._plan
+        plan.skipped += 1
+        if plan.skipped == _LONG_WAIT:
+            warnings.warn(
+                f"A checkpoint has been due for {_LONG_WAIT} rollouts, but the agents' rollouts have unequal lengths and do"
+                " not begin together. Give all agents the same number of steps between updates for checkpoints from which the"
+                " training goes on exactly."
+            )
 
     @property
     def _all_begin(self) -> bool:
@@ -172,14 +204,14 @@ class Checkpoints(BaseCallback):
 
     def save_last(self) -> Path | None:
         """
-        Write the last good state as the newest checkpoint, if it is one and not written yet.
+        Write the last state from which the training goes on exactly as the newest checkpoint, if it has not been written yet.
 
-        :return: Its file; None if there is no state from which the training goes on exactly
+        :return: Its file; None if there is no such state
         :raises OSError: If it cannot be written
         """
-        kept = self._plan.kept
-        if kept.path is None and kept.content is not None and kept.is_exact:
-            self._write()
+        kept = self._plan.kept_exact
+        if kept.path is None and kept.content is not None:
+            self._write(kept)
         return kept.path
 
     def save_now(self) -> Path | None:
@@ -192,13 +224,13 @@ class Checkpoints(BaseCallback):
         plan = self._plan
         if not plan.exact:
             return None
-        if plan.kept.steps != self._team.num_timesteps or plan.kept.path is None:
+        if plan.kept_exact.steps != self._team.num_timesteps or plan.kept_exact.path is None:
             try:
                 self._take(exact=True)
             except ValueError:
                 # Some agents have finished before others, so they are not in step
                 return None
-            self._write()
+            self._write(plan.kept)
         return plan.kept.path
 
     # Taking and writing
@@ -217,7 +249,7 @@ class Checkpoints(BaseCallback):
         try:
             if self._fits:
                 self._take(exact=True)
-                self._write()
+                self._write(plan.kept)
             else:
                 self._write_directly()
         except OSError as error:
@@ -240,21 +272,20 @@ class Checkpoints(BaseCallback):
         if not (exact and plan.exact):
             self._team.save(file)
         end = time.monotonic()
-        plan.kept = _Kept(self._team.num_timesteps, file.getvalue(), exact and plan.exact, end, end - start)
+        plan.keep_state(_Kept(self._team.num_timesteps, file.getvalue(), exact and plan.exact, end, end - start))
 
     def _path(self, steps: int) -> Path:
         return self._plan.folder / f"{self._plan.name_prefix}_{steps}_steps.zip"
 
-    def _write(self) -> None:
-        """Write the state in memory, and what the logs hold up to it."""
-        kept = self._plan.kept
+    def _write(self, kept: _Kept) -> None:
+        """Write a state in memory, and what the logs hold up to it."""
         assert kept.content is not None
         self._sync_logs()
         make_folder(self._plan.folder)
         path = self._path(kept.steps)
         with replaced_file(path) as file:
             file.write(kept.content)
-        self._on_written(path)
+        self._on_written(kept, path)
         if len(kept.content) > _MOST_BYTES:
             kept.content = None
 
@@ -263,17 +294,17 @@ class Checkpoints(BaseCallback):
         self._sync_logs()
         path = self._path(self._team.num_timesteps)
         self._team.save(path, exact=True)
-        self._plan.kept = _Kept(self._team.num_timesteps, None, True, time.monotonic())
-        self._on_written(path)
+        self._plan.keep_state(_Kept(self._team.num_timesteps, None, True, time.monotonic()))
+        self._on_written(self._plan.kept, path)
 
-    def _on_written(self, path: Path) -> None:
+    def _on_written(self, kept: _Kept, path: Path) -> None:
         plan = self._plan
-        plan.kept.path = path
+        kept.path = path
         if self.verbose:
             print(f"Checkpoint: {path}")
         numbered = checkpoint_files(plan.folder, plan.name_prefix)
         # Those of later steps are damaged ones, from before the training went on from an earlier one
-        for _, old in [pair for pair in numbered if pair[0] <= plan.kept.steps][: -plan.keep]:
+        for _, old in [pair for pair in numbered if pair[0] <= kept.steps][: -plan.keep]:
             old.unlink(missing_ok=True)
 
     def _sync_logs(self) -> None:

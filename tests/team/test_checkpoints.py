@@ -200,7 +200,7 @@ def test_resets_at_checkpoints_do_not_depend_on_the_clock(tmp_path, clock, save_
     assert team.saves == [(k, k % freq == 0) for k in range(0, 2 * freq + 1, freq // 4)]
     rollouts(team, callback, 2 * freq + 1)
     assert callback.last.content == str(2 * freq + 1).encode()
-    assert callback.save_last() is None
+    assert callback.save_last() == tmp_path / f"team_{2 * freq}_steps.zip"
 
 
 def test_a_training_that_goes_on_has_its_state_already(tmp_path, clock):
@@ -217,14 +217,33 @@ def test_a_training_that_goes_on_has_its_state_already(tmp_path, clock):
     assert names(tmp_path) == ["team_300_steps.zip", "team_400_steps.zip"]
 
 
-def test_there_is_none_where_an_agent_is_in_the_middle_of_a_rollout(tmp_path, clock):
+def test_where_an_agent_is_in_the_middle_of_a_rollout_the_models_are_kept(tmp_path, clock, recwarn):
     team, callback = start(tmp_path, save_freq=100)
     rollouts(team, callback, 0)
     team._loop.begins_rollouts = False
-    rollouts(team, callback, 100)
+    rollouts(team, callback, 100, 110)
+    # Exactly it goes on from the beginning only
+    assert callback.last.content == b"110" and callback.save_last() == tmp_path / "team_0_steps.zip"
     team._loop.begins_rollouts = True
-    rollouts(team, callback, 120)
+    rollouts(team, callback, 120, 150)
     assert names(tmp_path) == ["team_0_steps.zip", "team_120_steps.zip"]
+    team._loop.begins_rollouts = False
+    rollouts(team, callback, 160)
+    # The one at 150 has been kept for an interruption, beside newer models
+    assert callback.last.content == b"160"
+    assert callback.save_last().read_bytes() == b"150 exact"
+    assert names(tmp_path) == ["team_120_steps.zip", "team_150_steps.zip"]
+    assert not recwarn
+
+
+def test_a_long_wait_is_said_once(tmp_path, clock):
+    team, callback = start(tmp_path, save_freq=100)
+    team._loop.begins_rollouts = False
+    rollouts(team, callback, *range(0, 190, 10))
+    with pytest.warns(UserWarning, match="has been due for 20 rollouts, but the agents' rollouts have unequal lengths"):
+        rollouts(team, callback, 190)
+    rollouts(team, callback, *range(200, 600, 10))
+    assert names(tmp_path) == []
 
 
 def test_a_second_training_counts_anew(tmp_path, clock):
