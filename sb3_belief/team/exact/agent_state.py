@@ -22,11 +22,11 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from torch import nn
 
+from sb3_belief.belief_ppo.cut_returns import CutReturns
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState
+from sb3_belief.common.safe_files.trust import MODEL_PACKAGES, Trust, is_allowed
 
-#: Packages whose classes the state of an agent may name; those of the agent's own model come on top
-PACKAGES = ("stable_baselines3", "sb3_contrib", "sb3_belief", "torch", "numpy", "gymnasium")
 # Parts of a model that its zip or its team saves, and constants
 _NO_STATE = (nn.Module, th.optim.Optimizer, spaces.Space, BaseBuffer, Logger, VecEnv, th.device, str, type)
 # Of a learn() that has begun, not of the model
@@ -89,8 +89,9 @@ def write_agent_state(model: BaseAlgorithm, rng: RngState, state: PlainData) -> 
     :raises ValueError: If the state is not that of such a model
     """
     # The model itself has been loaded, so its own package is trusted already
-    known = {*PACKAGES, type(model).__module__.partition(".")[0]}
-    saved = decode(state, lambda module: module.partition(".")[0] in known, "state")
+    module = type(model).__module__
+    trust = Trust(False, () if is_allowed(module, MODEL_PACKAGES) else (module.partition(".")[0],))
+    saved = decode(state, trust.allowed, "state", lambda found: found is CutReturns or trust.accepts(found))
     try:
         _put_back(model, saved)
         rng.set(saved["rng"])

@@ -17,8 +17,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.common.file_names import file_name
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.common.safe_files.trust import UNTRUSTED
 from sb3_belief.team.agent_models import AgentModels
-from sb3_belief.team.exact.agent_state import PACKAGES, read_agent_state, write_agent_state
+from sb3_belief.team.exact.agent_state import read_agent_state, write_agent_state
 from sb3_belief.team.exact.counted import callback_states, have_classes, restore_callbacks, restore_wrappers, wrapper_states
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.logs import TeamLog
@@ -174,7 +175,7 @@ class ExactTraining:
                 "This file does not hold the exact state of a training: it was saved without exact=True. Load it without, and"
                 " the training goes on with new episodes and other random numbers."
             )
-        state = decode(parts[_TEAM], lambda module: module.partition(".")[0] in PACKAGES, "the exact state of the team")
+        state = decode(parts[_TEAM], UNTRUSTED.allowed, "the exact state of the team", UNTRUSTED.accepts)
         if not (isinstance(state, dict) and state.keys() == _ENTRIES and state["counters"].keys() == set(_COUNTERS)):
             raise ValueError("The exact state of the team is damaged, or of another version of this package.")
         if state["n_envs"] != loop.num_envs:
