@@ -47,7 +47,7 @@ def resume_config(
                 f"-params: {key!r} cannot be set with -i, the saved models keep their settings.{suggestion(key, changeable)}"
                 f" Allowed: {', '.join(changeable)}."
             )
-    run = run_of(find_team(trained, "--trained-agent"))
+    run = run_of(find_team(trained, "--trained-agent", tells=False))
     if run is not None:
         saved_algo, saved_env, saved_conf = run
         check_record(run, further.get("extra_packages", ()), of_env=env_id is None, trust=trust)

@@ -178,7 +178,7 @@ def environment_versions(env_id: str, env: VecEnv) -> dict[str, str]:
     return found
 
 
-def find_team(run: str | os.PathLike[str], flag: str) -> Path:
+def find_team(run: str | os.PathLike[str], flag: str, tells: bool = True) -> Path:
     """
     Return the path of a saved team.
 
@@ -186,6 +186,7 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
 
     :param run: Folder of a run, or zip of a team
     :param flag: Flag or command that it was given to, for the error message
+    :param tells: Whether to say that the run has not finished
     :return: Path of the zip
     :raises ConfigError: If there is none
     """
@@ -207,7 +208,7 @@ def find_team(run: str | os.PathLike[str], flag: str) -> Path:
         names = comma_separated(others, most=10) or "it has none"
         raise ConfigError(f"{flag}: no {TEAM} in {str(path)!r}. Give one of its zips: {names}.")
     team = path / TEAM if checkpoint is None else checkpoint
-    if status in UNFINISHED:
+    if status in UNFINISHED and tells:
         how = f" What -i trains is a new run; train --resume {path} continues this one exactly." if flag in _TRAINED else ""
         print(f"{path} has not finished ({status}): {team.relative_to(path)} is taken.{how}", file=sys.stderr)
     return team

@@ -17,6 +17,7 @@ from sb3_belief.team import Team
 from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.endings import SignalCheck
 from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.resume import resume_config
 from sb3_belief.zoo.run_folder import find_team, whole_checkpoints
 from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train_options import TrainOptions
@@ -310,7 +311,10 @@ def test_a_run_that_trains_is_held(tmp_path, monkeypatch):
 def test_others_take_the_newest_checkpoint_of_an_unfinished_run(tmp_path, capsys, monkeypatch):
     run = stopped(tmp_path / "logs", 300)
     assert find_team(run, "enjoy") == run / "team.zip"
-    assert f"{run} has not finished (failed): team.zip is taken." in capsys.readouterr().err
+    assert capsys.readouterr().err.count(f"{run} has not finished (failed): team.zip is taken.") == 1
+    # With -i it is said where the team is taken, and not where its settings are read before
+    resume_config(str(run))
+    assert capsys.readouterr().err == ""
     # Killed: there is no team, or one of before
     (run / "run.json").write_text(json.dumps({**record_of(run), "status": "running"}))
     newest = run / "checkpoints" / "team_240_steps.zip"
