@@ -248,7 +248,9 @@ def read_team(path: str | os.PathLike | io.BufferedIOBase, trust: Trust = UNTRUS
     :raises ValueError: If it is not the file of a saved team, is damaged, or is of an earlier version and not trusted
     """
     if isinstance(path, io.BufferedIOBase):
-        return _read_team(path, str(getattr(path, "name", "The open file")), trust)
+        # Of a file without a name in the file system it is a number
+        name = getattr(path, "name", None)
+        return _read_team(path, name if isinstance(name, str) else "The open file", trust)
     path = pathlib.Path(path)
     if not path.exists() and path.suffix != ".zip":
         path = path.with_name(f"{path.name}.zip")

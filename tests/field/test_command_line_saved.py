@@ -134,7 +134,7 @@ def test_a_word_of_trust_loads_anything(runs, tmp_path, monkeypatch):
     [
         ("record", "run.json: is not readable as JSON"),
         ("empty", "run.json: must be a mapping, not list"),
-        ("model", "agent 'follower' is not a zip, or it is damaged"),
+        ("model", "agent 'follower' wasn't a zip-file, or it is damaged"),
         ("statistics", "agent 'follower', member 'agents/follower.vecnormalize.json': it is no JSON"),
         ("weights", "agent 'follower', member 'policy.pth': it holds no tensors"),
         ("class", "the agent 'follower' is a os:BeliefPPO, but 'os:BeliefPPO' is of a package that is not allowed"),

@@ -4,6 +4,7 @@ import io
 import json
 import subprocess
 import sys
+import tempfile
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -133,6 +134,20 @@ def test_open_files_and_classes():
     loaded = Team.load(file, env=make_team_env(ToyEnv))
     assert [type(model) for model in loaded.agents.values()] == [A2C, DQN]
     loaded.learn(20)
+
+
+def test_open_files_need_no_name_and_may_be_anywhere():
+    with tempfile.TemporaryFile() as file:
+        trained().save(file)
+        # As it has been left by the save
+        assert Team.load(file, device="cpu").num_timesteps == 32 and not file.closed
+    with tempfile.TemporaryFile() as file:
+        BeliefPPO("BeliefPolicy", gym.make("CartPole-v1"), belief="none", gamma=0.5, **PPO_KWARGS).save(file)
+        assert BeliefPPO.load(file, device="cpu").gamma == 0.5 and not file.closed
+        file.truncate(100)
+        for load in (Team.load, BeliefPPO.load):
+            with pytest.raises(ValueError, match=r"The open file wasn't a zip-file|The open file is not a saved team"):
+                load(file)
 
 
 def test_an_environment_that_does_not_fit(tmp_path):

@@ -77,7 +77,7 @@ def names_in(file: BinaryIO, where: str) -> list[str]:
             return archive.namelist()
     # A damaged file makes zipfile raise whatever its numbers lead to
     except Exception as error:
-        raise ValueError(f"{where} is not a zip, or it is damaged: {_text(error)}.") from None
+        raise ValueError(f"{where} wasn't a zip-file, or it is damaged: {_text(error)}.") from None
 
 
 def read_archive(file: BinaryIO, where: str) -> dict[str, bytes]:

@@ -99,9 +99,11 @@ def read_model(path: Any) -> tuple[bytes, str]:
     """
     # Open files have a name, too, but for those in memory
     name = os.fspath(path) if isinstance(path, (str, os.PathLike)) else getattr(path, "name", None)
-    where = "The open file" if name is None else str(name)
+    where = name if isinstance(name, str) else "The open file"
     file = open_path(pathlib.Path(path) if isinstance(path, os.PathLike) else path, "r", verbose=0, suffix="zip")
     try:
+        # An open file may be where its last use has left it
+        file.seek(0)
         return file.read(), where
     finally:
         if isinstance(path, (str, os.PathLike)):

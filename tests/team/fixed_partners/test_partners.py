@@ -111,7 +111,7 @@ def test_zips_of_single_models(tmp_path, algo):
 
 def test_files_that_hold_no_partner(tmp_path):
     (tmp_path / "text.zip").write_text("nothing")
-    with pytest.raises(ValueError, match="is not a zip, or it is damaged"):
+    with pytest.raises(ValueError, match="wasn't a zip-file, or it is damaged"):
         AgentEnv(toy(2), "agent_0", {"agent_1": tmp_path / "text.zip"})
     model = PPO("MlpPolicy", gym.make("CartPole-v1"), **PPO_KWARGS)
     model.save(tmp_path / "cartpole.zip")
