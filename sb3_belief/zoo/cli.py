@@ -2,8 +2,11 @@
 
 import argparse
 import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -70,9 +73,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         SIGHUP, Ctrl-C (SIGINT) or SIGTERM ended the training, whose last good state is saved then; 141 if the pipe that takes
         the output was closed
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    args = make_parser().parse_args(argv)
-    return _run(COMMANDS[args.subcommand][2], args, ["sb3-belief", *argv])
+    words = list(sys.argv[1:] if argv is None else argv)
+    args = make_parser().parse_args(words)
+    with _one_exit_status(ends=argv is None):
+        return _run(COMMANDS[args.subcommand][2], args, ["sb3-belief", *words])
 
 
 def train_main(argv: Sequence[str] | None = None) -> int:
@@ -82,11 +86,39 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     :param argv: The words after the name of the script. None for those of the process
     :return: Exit status, as of ``main``
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
+    words = list(sys.argv[1:] if argv is None else argv)
     parser = _Parser(prog="train.py", description="Train a team from a YAML configuration.", **STYLE)
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     add_train(parser)
-    return _run(_train, parser.parse_args(argv), ["python", "train.py", *argv])
+    args = parser.parse_args(words)
+    with _one_exit_status(ends=argv is None):
+        return _run(_train, args, ["python", "train.py", *words])
+
+
+@contextmanager
+def _one_exit_status(ends: bool) -> Iterator[None]:
+    """
+    Have SIGTERM and SIGHUP end the program by the exit status that they are documented to have.
+
+    A training saves first; before and after it they would kill the process, also one that has saved because of a first signal
+    and is about to say so.
+
+    :param ends: Whether the process ends with the block, so that nothing need be put back
+    """
+
+    def leave(signum: int, _: Any) -> NoReturn:
+        sys.exit(128 + signum)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if is_main and hasattr(signal, name)]
+    handled = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in handled:
+        signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, signal.SIG_IGN if ends else signal.SIG_DFL)
 
 
 def _run(action: Callable[[argparse.Namespace, list[str]], int], args: argparse.Namespace, command: list[str]) -> int:

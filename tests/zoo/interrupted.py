@@ -87,4 +87,5 @@ if __name__ == "__main__":
     if int(times) > 1:
         call_before(SignalCheck, "_on_step", lambda self: self.num_timesteps == 164, lambda: slow_saves(0.3))
     prepare(moment, lambda: hit(getattr(signal, name), int(times)))
-    sys.exit(train_main(words))
+    sys.argv[1:] = words
+    sys.exit(train_main())
