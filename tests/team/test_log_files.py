@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import time
 
 import numpy as np
 import pytest
@@ -188,6 +189,8 @@ def test_tensorboard_shows_each_step_once(tmp_path):
     log.sync()
     for step in (3, 4):
         dump(log, step, -1)
+    # TensorBoard orders the files of a run by the second of their beginning
+    time.sleep(1.1)
     again = TeamLog(agents, 0, None, str(tmp_path), continue_from=state)
     for step in (3, 4, 5):
         dump(again, step, step)

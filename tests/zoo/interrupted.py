@@ -84,8 +84,13 @@ def slow_saves(seconds):
 
 if __name__ == "__main__":
     moment, name, times, *words = sys.argv[1:]
-    if int(times) > 1:
-        call_before(SignalCheck, "_on_step", lambda self: self.num_timesteps == 164, lambda: slow_saves(0.3))
-    prepare(moment, lambda: hit(getattr(signal, name), int(times)))
+
+    def action():
+        if int(times) > 1:
+            # The next signals come while the state is saved
+            slow_saves(0.3)
+        hit(getattr(signal, name), int(times))
+
+    prepare(moment, action)
     sys.argv[1:] = words
     sys.exit(train_main())
