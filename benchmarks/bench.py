@@ -16,6 +16,7 @@ Parts:
 - ``e``: peak memory, each program in a process of its own
 - ``cores``: two cores against one
 - ``workers``: an environment whose step takes 10 ms, in worker processes (benchmarks/heavy.py)
+- ``finite``: updates with the search for what is not finite, against updates alone (benchmarks/finite.py)
 - ``gpu``: updates on a GPU against the CPU, where there is a GPU
 
 torch uses one thread. Speeds are joint steps (of one copy) per second of CPU time, including that of workers, and per second
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import acting, cores, gpu, growth, heavy, memory
+from benchmarks import acting, cores, finite, gpu, growth, heavy, memory
 from benchmarks.measure import Loop, Sample, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
@@ -106,6 +107,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "e": memory.run,
     "cores": cores.run,
     "workers": heavy.run,
+    "finite": finite.run,
     "gpu": gpu.run,
 }
 

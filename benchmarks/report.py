@@ -24,6 +24,9 @@ BARS: dict[str, tuple[str, float]] = {
     "history_6400_vs_800": ("<=", 4.0),
     "two_cores_vs_one": (">=", 1.5),
     "workers_vs_ideal": (">=", 0.85),
+    "checks_dqn": ("<=", 1.03),
+    "checks_sac": ("<=", 1.02),
+    "checks_ppo": ("<=", 1.02),
 }
 #: The same of peak memory, in MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}

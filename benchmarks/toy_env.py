@@ -21,15 +21,17 @@ class ToyTeamEnv(TeamVecEnv):
     :param num_envs: Number of copies
     :param n_agents: Number of agents that learn
     :param n_scripted: Number of others that do not learn
+    :param action_space: Of the learning agents, by default a few discrete actions
     """
 
-    def __init__(self, num_envs: int, n_agents: int, n_scripted: int = 0) -> None:
+    def __init__(self, num_envs: int, n_agents: int, n_scripted: int = 0, action_space: spaces.Space | None = None) -> None:
+        action_space = spaces.Discrete(N_ACTIONS) if action_space is None else action_space
         agents = [f"agent_{i}" for i in range(n_agents)]
         super().__init__(
             num_envs,
             agents,
             {agent: spaces.Box(-np.inf, np.inf, (WIDTH,), np.float32) for agent in agents},
-            {agent: spaces.Discrete(N_ACTIONS) for agent in agents},
+            {agent: action_space for agent in agents},
             scripted_action_spaces={f"scripted_{i}": spaces.Discrete(N_ACTIONS) for i in range(n_scripted)},
         )
         self._rng = np.random.default_rng(0)

@@ -2,8 +2,18 @@
 
 from sb3_belief.envs.env_util import make_team_env
 from sb3_belief.team.checkpoints import Checkpoints
+from sb3_belief.team.finite import NonFiniteError
 from sb3_belief.team.fixed_partners import AgentEnv
 from sb3_belief.team.team import Team
 from sb3_belief.vec_env import JointEnv, ParallelTeamVecEnv, TeamVecEnv
 
-__all__ = ["AgentEnv", "Checkpoints", "JointEnv", "ParallelTeamVecEnv", "Team", "TeamVecEnv", "make_team_env"]
+__all__ = [
+    "AgentEnv",
+    "Checkpoints",
+    "JointEnv",
+    "NonFiniteError",
+    "ParallelTeamVecEnv",
+    "Team",
+    "TeamVecEnv",
+    "make_team_env",
+]

@@ -11,7 +11,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -21,8 +20,9 @@ from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team.arguments import as_callback, check_agent_keys
 from sb3_belief.team.checkpoint import SavedTeam
+from sb3_belief.team.finite import UpdateGuard
 from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.lockstep.scheduler import AgentTask, SyncCallback
 from sb3_belief.team.normalization import AgentNormalize
 from sb3_belief.team.predictor import Predictor
 from sb3_belief.team.sb3_protocol import algorithm_arguments
@@ -261,7 +261,12 @@ class AgentModels:
 
 
 def run_learn(
-    model: BaseAlgorithm, callback: BaseCallback, total_timesteps: int, log_interval: int | None, reset_num_timesteps: bool
+    model: BaseAlgorithm,
+    callback: SyncCallback,
+    total_timesteps: int,
+    log_interval: int | None,
+    reset_num_timesteps: bool,
+    on_nan: str,
 ) -> None:
     """
     Run a model's own ``learn``, in this process or in a worker.
@@ -271,14 +276,22 @@ def run_learn(
     :param total_timesteps: As in ``Team.learn``
     :param log_interval: As in ``Team.learn``
     :param reset_num_timesteps: As in ``Team.learn``
+    :param on_nan: As in ``Team``
     """
-    model.learn(
-        total_timesteps,
-        callback=callback,
-        # SB3's loops take None for "never", although their signatures do not say so
-        log_interval=log_interval,  # type: ignore[arg-type]
-        reset_num_timesteps=reset_num_timesteps,
-    )
+    guard = callback.update_check = UpdateGuard(callback.agent, model, on_nan)
+    try:
+        model.learn(
+            total_timesteps,
+            callback=callback,
+            # SB3's loops take None for "never", although their signatures do not say so
+            log_interval=log_interval,  # type: ignore[arg-type]
+            reset_num_timesteps=reset_num_timesteps,
+        )
+    except Exception as error:
+        guard.explain(error)
+        raise
+    finally:
+        guard.disarm()
 
 
 def normalized(env: VecEnv, normalize: bool | Mapping[str, Any], gamma: float | None) -> VecNormalize:

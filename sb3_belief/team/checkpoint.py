@@ -34,6 +34,7 @@ from sb3_belief.common.safe_files.archive import SUMS, from_json, names_in, read
 from sb3_belief.common.safe_files.models import add_plain_data, check_parameters
 from sb3_belief.common.safe_files.trust import PICKLE, UNTRUSTED, Trust
 from sb3_belief.common.versions import versions
+from sb3_belief.team.finite import check_finite
 from sb3_belief.team.model_zips import find_algorithm, load_algorithm
 from sb3_belief.team.normalization import AgentNormalize
 
@@ -190,7 +191,9 @@ def write_team(
     :param statistics: Normalisation of the agents that have one, by agent
     :param manifest: Entries of ``team.json`` besides the format, agents, classes and versions
     :param parts: What else is to be saved, by names that can be part of a path
+    :raises ValueError: If something of a model or its normalisation is not finite
     """
+    check_finite(models, statistics)
     classes = {agent: name_of(type(model)) for agent, model in models.items()}
     manifest = {"format": FORMAT, "agents": list(models), "classes": classes, **manifest, "versions": versions()}
     members: dict[str, bytes | Callable[[], bytes]] = {"team.json": to_json(manifest, indent=2)}

@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import get_latest_run_id, safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.common.file_names import file_name
+from sb3_belief.team.finite import SKIPPED
 from sb3_belief.team.log_files import counters, open_logger, put_counters_back, sync_logger, table_state
 
 
@@ -112,6 +113,8 @@ class TeamLog:
         # Values that each agent has dumped since the last table, and the outputs from which each key is excluded
         self.latest: dict[str, dict[str, Any]] = {}
         self._algorithms: dict[str, str] = {}
+        # How many updates of each agent have been taken back, of those of which any has
+        self._skipped: dict[str, int] = {}
         self.excluded: dict[str, tuple[str, ...]] = {}
         before = continue_from or {}
         # The folder of the TensorBoard run, and the first step of which a run before this one shows nothing in it
@@ -167,7 +170,8 @@ class TeamLog:
 
     def record_means(self, logger: Logger) -> None:
         """
-        Record the means over the agents of the values dumped since the last table, for some also the standard deviations.
+        Record the means over the agents of the values dumped since the last table, for some also the standard deviations, and
+        the number of updates that were taken back.
 
         What different algorithms record in training cannot be compared: ``train/loss`` becomes ``train/PPO/loss`` and
         ``train/DQN/loss`` in a team of both.
@@ -179,6 +183,9 @@ class TeamLog:
         # In the order of the team, and not of who was first, on which the last bits of a mean would depend
         for agent in filter(self.latest.__contains__, self.agent_loggers):
             for key, value in self.latest[agent].items():
+                if key == SKIPPED:
+                    self._skipped[agent] = int(value)
+                    continue
                 # The team records times itself; images, texts and the like are only in the agents' own logs
                 if isinstance(value, (Number, np.number)) and not key.startswith("time/"):
                     shown = self._shown(agent, key)
@@ -189,6 +196,9 @@ class TeamLog:
             logger.record(shown, float(np.mean(numbers)), exclude=excluded)
             if _has_spread(keys[shown]) and len(numbers) > 1:
                 logger.record(f"{shown}_std", float(np.std(numbers)), exclude=excluded)
+        if self._skipped:
+            # The number of all agents, also of those that have finished
+            logger.record(SKIPPED, sum(self._skipped.values()))
         self.latest.clear()
 
     def _shown(self, agent: str, key: str) -> str:
@@ -219,6 +229,7 @@ class TeamLog:
                 agent: {key: float(value) for key, value in values.items() if isinstance(value, (Number, np.number))}  # type: ignore[arg-type]
                 for agent, values in self.latest.items()
             },
+            "skipped": dict(self._skipped),
             "excluded": {key: list(outputs or ()) for key, outputs in self.excluded.items()},
         }
 
@@ -234,6 +245,7 @@ class TeamLog:
         for agent, iterations in self._iterations.items():
             iterations.go_on_from(state["iterations"][agent])
         self.latest.clear()
+        self._skipped.update(state["skipped"])
         self.latest.update({agent: dict(values) for agent, values in state["latest"].items()})
         self.excluded.update({key: tuple(outputs) for key, outputs in state["excluded"].items()})
 

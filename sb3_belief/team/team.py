@@ -24,6 +24,7 @@ from sb3_belief.team.arguments import as_callback, check_agent_keys, check_team_
 from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.exact import ExactTraining, check_exact_load
+from sb3_belief.team.finite import check_on_nan
 from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.masks import MaskCheck
@@ -67,11 +68,13 @@ class Team(SB3Protocol):
         replaced) learns in the main process, and so do all agents, with a warning, if the team has a callback that is not from
         SB3 or sb3-contrib. For models on the CPU, in a script that can be imported (``if __name__ == "__main__":``); with
         ``torch.set_num_threads(1)`` each process takes one core
+    :param on_nan: What is done when an update makes loss or parameters of an agent non-finite: ``"raise"`` puts back the last
+        finite ones and stops with a ``NonFiniteError``, ``"skip"`` takes the update back, warns and goes on
     :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
     :param kwargs: Further arguments of the algorithm class for all agents
     :raises TypeError: If ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
-    :raises ValueError: If agents are unknown or missing, if ``jobs`` is not a number of processes, or if a model cannot learn
-        in another process
+    :raises ValueError: If agents are unknown or missing, if ``jobs`` is not a number of processes, ``on_nan`` unknown, or if
+        a model cannot learn in another process
     """
 
     def __init__(
@@ -87,9 +90,11 @@ class Team(SB3Protocol):
         device: th.device | str = "auto",
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
+        on_nan: str = "raise",
         **kwargs: Any,
     ):
         check_jobs(jobs)
+        check_on_nan(on_nan)
         loop = JointLoop(check_team_vec_env(env))
         names = loop.possible_agents
         classes, policies = per_agent("algo_class", algo_class, names), per_agent("policy", policy, names)
@@ -97,7 +102,7 @@ class Team(SB3Protocol):
         check_agent_keys("agent_kwargs", own_kwargs, names)
         specs = {name: AgentSpec(classes[name], policies[name], {**kwargs, **own_kwargs.get(name, {})}) for name in names}
         agents = AgentModels.build(specs, loop, seed, normalize, max(verbose - 1, 0), device)
-        self._setup(loop, agents, loop.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs)
+        self._setup(loop, agents, loop.scripted, seed, normalize, verbose, log_dir, tensorboard_log, jobs, on_nan)
         if seed is not None:
             env.seed(env_seed(seed))
 
@@ -112,6 +117,7 @@ class Team(SB3Protocol):
         log_dir: str | None,
         tensorboard_log: str | None,
         jobs: int,
+        on_nan: str,
     ) -> None:
         self._loop = loop
         self._agents = agents
@@ -120,7 +126,7 @@ class Team(SB3Protocol):
         self.possible_agents = list(agents.models)
         self.seed = seed
         self.normalize = normalize
-        self.verbose = verbose
+        self.verbose, self.on_nan = verbose, on_nan
         self.num_timesteps = 0
         windows = {model._stats_window_size for model in agents.models.values()}
         # Agents with windows of their own leave the team SB3's
@@ -205,6 +211,7 @@ class Team(SB3Protocol):
                 total_timesteps=total_timesteps,
                 log_interval=log_interval,
                 reset_num_timesteps=reset_num_timesteps,
+                on_nan=self.on_nan,
             )
             tasks = self._agents.tasks(learn, own_callbacks)
             fresh = reset_num_timesteps or not self._can_continue or any(m._last_obs is None for m in self.agents.values())
@@ -282,20 +289,18 @@ class Team(SB3Protocol):
         :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
         :param exact: Whether to save all that decides how the training goes on, so that ``Team.load(path, env, exact=True)``
             resumes it bit for bit: in the ``_on_rollout_start()`` of a team's callback, or after ``learn()``
-        :raises ValueError: If that is asked for elsewhere, or if a worker process (``jobs``) ended before its agents'
-            models had come back, so that they are behind the others
+        :raises ValueError: If that is asked for elsewhere, if something of a model is not finite, or if a worker process
+            (``jobs``) ended before its agents' models had come back, so that they are behind the others
         """
         # First, since an environment without a readable state begins new episodes
-        state = self._exact.read(self._loop, self._learning, self._can_continue, self._log) if exact else None
+        state = self._exact.read(self._loop, self._learning, self._can_continue, self._log).parts() if exact else {}
         manifest = {
             "seed": self.seed,
             "num_timesteps": self.num_timesteps,
             "normalize": self.normalize,
             **spaces_manifest(self.observation_space, self.action_space, self.possible_agents, self._scripted),
         }
-        write_team(
-            path, self._parallel.models_to_save(), self._agents.statistics, manifest, {} if state is None else state.parts()
-        )
+        write_team(path, self._parallel.models_to_save(), self._agents.statistics, manifest, state)
 
     @classmethod
     def load(
@@ -310,6 +315,7 @@ class Team(SB3Protocol):
         tensorboard_log: str | None = None,
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
+        on_nan: str = "raise",
         exact: bool = False,
         trust_pickle: bool = False,
         allow_packages: Iterable[str] = (),
@@ -328,6 +334,7 @@ class Team(SB3Protocol):
         :param tensorboard_log: As in the constructor
         :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
         :param jobs: As in the constructor
+        :param on_nan: As in the constructor
         :param exact: Whether the next ``learn(..., reset_num_timesteps=False)`` goes on bit for bit where the team was saved
             with ``exact=True``: episodes, random numbers, buffers, logs, and callbacks if the same ones are given in the same
             order. Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
@@ -338,9 +345,10 @@ class Team(SB3Protocol):
         :return: The team
         :raises FileNotFoundError: If there is no such file
         :raises TypeError: If an agent's algorithm has no argument of that name
-        :raises ValueError: If it is damaged, no team or not trusted, the environment does not fit it, or ``jobs`` is wrong
+        :raises ValueError: If it is damaged, no team or not trusted, or the environment or an argument does not fit
         """
         check_jobs(jobs)
+        check_on_nan(on_nan)
         if exact:
             check_exact_load(env, {**kwargs, **(agent_kwargs or {})})
         saved = read_team(path, Trust.of(trust_pickle, allow_packages))
@@ -352,7 +360,7 @@ class Team(SB3Protocol):
         seed = kwargs.pop("seed", manifest["seed"])
         team = cls.__new__(cls)
         agents = AgentModels.load(saved, loop, seed, options)
-        team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs)
+        team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs, on_nan)
         team.num_timesteps = manifest["num_timesteps"]
         if exact:
             team._exact.load(saved.parts, loop)

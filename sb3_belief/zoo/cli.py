@@ -202,7 +202,7 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
         config = resume_config(args.trained_agent, args.algo, args.env, trust=args.trust, **settings)
     names = (
         "log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq save_every"
-        " vec_env step_timeout restart_workers device num_threads jobs progress trained_agent trust verbose"
+        " vec_env step_timeout restart_workers device num_threads jobs on_nan progress trained_agent trust verbose"
     )
     seed = None if args.seed is None else args.seed[0]
     options = TrainOptions(

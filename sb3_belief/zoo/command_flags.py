@@ -136,6 +136,12 @@ def add_train(parser: argparse.ArgumentParser) -> None:
         default=1,
         help="number of processes in which agents with on-policy algorithms learn; the result is the same for any number",
     )
+    parser.add_argument(
+        "--on-nan",
+        choices=["raise", "skip"],
+        default="raise",
+        help="if an update makes loss or parameters non-finite: stop with an error, or take the update back and go on",
+    )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
     parser.add_argument(
         "-i", "--trained-agent", type=filled_text, help="folder of a run, or zip of a team, whose training is to be continued"

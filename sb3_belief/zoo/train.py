@@ -238,6 +238,7 @@ def common_arguments(config: RunConfig, options: TrainOptions, folder: Path | No
         verbose=options.verbose,
         log_dir=None if folder is None else str(folder),
         jobs=options.jobs,
+        on_nan=options.on_nan,
     )
 
 

@@ -35,6 +35,7 @@ class TrainOptions:
     :param num_threads: Number of torch's threads, -1 for torch's default
     :param jobs: Number of processes, the main one included, in which the agents with on-policy algorithms learn. Each agent
         learns wholly in one of them. The result is the same for any number, to the bit on the CPU. See ``Team``
+    :param on_nan: ``"raise"`` or ``"skip"``: what is done when loss or parameters are not finite. See ``Team``
     :param progress: Whether to show a progress bar
     :param trained_agent: Folder of a run, or zip of a team, whose training is to be continued
     :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
@@ -57,6 +58,7 @@ class TrainOptions:
     device: str = "auto"
     num_threads: int = 1
     jobs: int = 1
+    on_nan: str = "raise"
     progress: bool = False
     trained_agent: str | None = None
     extra_packages: tuple[str, ...] = ()

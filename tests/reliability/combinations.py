@@ -105,8 +105,8 @@ def check_equal_to(run: Path, undisturbed: Path) -> int:
     assert mine._agents.statistics.keys() == theirs._agents.statistics.keys()
     for agent, statistics in theirs._agents.statistics.items():
         for name in ("obs_rms", "ret_rms", "returns"):
-            one, other = (getattr(each, name, None) for each in (mine._agents.statistics[agent], statistics))
-            assert _equal(*(vars(each) if hasattr(each, "__dict__") else each for each in (one, other))), (agent, name)
+            pair = [getattr(each, name, None) for each in (mine._agents.statistics[agent], statistics)]
+            assert _equal(*(vars(each) if hasattr(each, "__dict__") else each for each in pair)), (agent, name)
     for name in ("status", "timesteps", "total_timesteps", "start_timesteps", "seed"):
         assert record_of(run)[name] == record_of(undisturbed)[name], name
     # None lost and none doubled, whatever else is equal

@@ -2,6 +2,7 @@
 
 import os
 import random
+from pathlib import Path
 
 import pytest
 
@@ -34,7 +35,7 @@ def check(launcher, combination, folder, seed, kills):
 
 def test_twenty_kills_are_drawn_over_all_settings():
     assert sum(KILLS.values()) == 20
-    words = [" ".join(each.command("logs", 0)) for each in BELIEF.values()]
+    words = [" ".join(each.command(Path("logs"), 0)) for each in BELIEF.values()]
     for present in ("traffic-junction", "mpe/", "lbf/", "convention-swap", "subproc", "--jobs 2", "normalize:true"):
         found = [present in line for line in words]
         assert any(found) and not all(found)

@@ -43,7 +43,7 @@ def _become(words: list[str], output: str, limit: int | None) -> int:
         # Python ignores the signal of this limit, so that a write raises an error, as on a full disk
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     # The server runs, but is no child of this process, which the original asks for
-    forkserver._forkserver.ensure_running = lambda: None
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]
     from sb3_belief.zoo.cli import main
 
     try:
@@ -62,7 +62,7 @@ def _start(words: list[str], output: str, limit: int | None = None) -> int:
         try:
             status = _become(words, output, limit)
             # As at the end of any process of multiprocessing: workers are ended
-            multiprocessing.util._exit_function()
+            multiprocessing.util._exit_function()  # type: ignore[attr-defined]
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -91,7 +91,7 @@ def main() -> None:
         if command == "start":
             answer = _start(*rest)
         elif command == "server":
-            answer = forkserver._forkserver._forkserver_pid
+            answer = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
         else:
             (pid,) = rest
             if pid not in ended:

@@ -10,7 +10,7 @@ import contextvars
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -51,6 +51,16 @@ class AgentTask:
     coroutine: greenlet = field(init=False)
 
 
+class UpdateCheck(Protocol):
+    """What looks at an agent's updates."""
+
+    def arm(self) -> None:
+        """Look at the next update."""
+
+    def disarm(self) -> None:
+        """Look at none."""
+
+
 class SyncCallback(CallbackList):
     """
     Runs an agent's own callback, then waits for the other agents: at each step, and at the beginning and end of each rollout.
@@ -64,22 +74,34 @@ class SyncCallback(CallbackList):
 
     def __init__(self, scheduler: "Scheduler", agent: str, callback: BaseCallback | None):
         super().__init__([] if callback is None else [callback])
-        self._scheduler, self._agent = scheduler, agent
+        self._scheduler, self.agent = scheduler, agent
+        #: Looks at the agent's updates, if its ``learn`` has set it
+        self.update_check: UpdateCheck | None = None
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
         for callback in self.callbacks:
             callback.update_locals(locals_)
 
     def on_step(self) -> bool:
-        return self._scheduler.vote(self._agent, super().on_step() if self.callbacks else True)
+        return self._scheduler.vote(self.agent, super().on_step() if self.callbacks else True)
 
     def _on_rollout_start(self) -> None:
+        if self.update_check is not None:
+            # Off-policy algorithms do not train after each rollout
+            self.update_check.disarm()
         super()._on_rollout_start()
-        self._scheduler.wait(self._agent, ROLLOUT_STARTS)
+        self._scheduler.wait(self.agent, ROLLOUT_STARTS)
 
     def _on_rollout_end(self) -> None:
         super()._on_rollout_end()
-        self._scheduler.wait(self._agent, ROLLOUT_ENDED)
+        self._scheduler.wait(self.agent, ROLLOUT_ENDED)
+        if self.update_check is not None:
+            self.update_check.arm()
+
+    def _on_training_end(self) -> None:
+        if self.update_check is not None:
+            self.update_check.disarm()
+        super()._on_training_end()
 
 
 class Scheduler(ABC):

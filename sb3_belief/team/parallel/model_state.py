@@ -7,7 +7,6 @@ changes by PyTorch's version counters, sees the training as if it had happened h
 """
 
 import random
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,41 +18,13 @@ from stable_baselines3.common.save_util import recursive_getattr
 from torch import nn
 
 from sb3_belief.team.batched_forward import BatchedForward
+from sb3_belief.team.model_parts import modules_of, optimizers_of
 from sb3_belief.team.parallel.messages import Message, dumps, loads
 
 # Attributes of a model that stay where they are
 _STAYS = ("env", "_vec_normalize_env", "_logger")
 # What PyTorch keeps in every module: parameters and submodules, which travel by themselves, and hooks
 _MODULE_KEYS = set(vars(nn.Module())) - {"training"}
-
-
-def modules_of(model: BaseAlgorithm) -> Iterator[tuple[str, nn.Module]]:
-    """
-    Iterate over all networks of a model and the modules in them.
-
-    :param model: A model
-    :return: Path and module
-    """
-    for name, root in vars(model).items():
-        if isinstance(root, nn.Module):
-            for path, module in root.named_modules():
-                yield f"{name}.{path}".rstrip("."), module
-
-
-def optimizers_of(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
-    """
-    Return the optimizers of a model and of its networks.
-
-    :param model: A model
-    :return: The optimizers by path
-    """
-    owners = [("", model), *((f"{path}.", module) for path, module in modules_of(model))]
-    return {
-        f"{path}{name}": value
-        for path, owner in owners
-        for name, value in vars(owner).items()
-        if isinstance(value, th.optim.Optimizer)
-    }
 
 
 def _tensors_of(model: BaseAlgorithm) -> dict[str, th.Tensor]:

@@ -24,8 +24,9 @@ from sb3_belief.common.rng import RngState
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.model_parts import modules_of, optimizers_of
 from sb3_belief.team.own_code import find_own_callback, runs_own_code
-from sb3_belief.team.parallel.model_state import modules_of, optimizers_of, pack
+from sb3_belief.team.parallel.model_state import pack
 from sb3_belief.team.parallel.remote_agents import RemoteAgents
 from sb3_belief.team.parallel.workers import Workers
 

@@ -1,0 +1,36 @@
+"""The networks and optimizers of a model, by the paths at which they are found."""
+
+from collections.abc import Iterator
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+
+def modules_of(model: BaseAlgorithm) -> Iterator[tuple[str, nn.Module]]:
+    """
+    Iterate over all networks of a model and the modules in them.
+
+    :param model: A model
+    :return: Path and module
+    """
+    for name, root in vars(model).items():
+        if isinstance(root, nn.Module):
+            for path, module in root.named_modules():
+                yield f"{name}.{path}".rstrip("."), module
+
+
+def optimizers_of(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
+    """
+    Return the optimizers of a model and of its networks.
+
+    :param model: A model
+    :return: The optimizers by path
+    """
+    owners = [("", model), *((f"{path}.", module) for path, module in modules_of(model))]
+    return {
+        f"{path}{name}": value
+        for path, owner in owners
+        for name, value in vars(owner).items()
+        if isinstance(value, th.optim.Optimizer)
+    }
