@@ -11,10 +11,12 @@ from typing import Any
 import cloudpickle
 from pettingzoo import AECEnv, ParallelEnv
 
+from sb3_belief.common.plain_data import NotPlainError
 from sb3_belief.envs.adapters.pettingzoo import in_model_form
 from sb3_belief.envs.random_play import PlayRecord, RandomPlayer, play_randomly
 from sb3_belief.envs.registry import spec
 from sb3_belief.envs.suites import load_attribute
+from sb3_belief.vec_env.copy_state import CopyState
 from sb3_belief.vec_env.observation_forms import ObservationForms
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.user_env import UserEnv, check_interface
@@ -241,7 +243,13 @@ def _report_like_masks(env: UserEnv, record: PlayRecord, report: Report) -> None
 def _report_state(env: UserEnv, seed: int, report: Report) -> None:
     get_state, set_state = optional_member(env, "get_state"), optional_member(env, "set_state")
     if get_state is None or set_state is None:
-        report.add("state", "note", "no get_state() and set_state(): a saved run can be resumed, but not exactly")
+        env.reset(seed=seed)
+        try:
+            CopyState(env.env).get()
+            how = "its attributes are saved in their place, and a run is resumed exactly"
+        except NotPlainError as error:
+            how = f"a run begins new episodes at each checkpoint, since {error}"
+        report.add("state", "note", f"no get_state() and set_state(): {how}")
         return
     change = "get_state() must return all that decides the following steps, as copies; set_state() must restore it"
     player = RandomPlayer(env, seed=0)

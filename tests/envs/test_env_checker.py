@@ -30,7 +30,8 @@ def test_a_report_says_what_was_seen():
     text = str(report)
     assert "visibility: 53.3% of the others' actions are visible, always mutual" in text
     assert "8 episodes of 5 to 5 steps, 8 terminated and 0 truncated; if 5 steps are a time limit, report it by trunc" in text
-    assert "note  state: no get_state()" in text and text.endswith("No failures.")
+    assert "note  state: no get_state() and set_state(): its attributes are saved in their place" in text
+    assert text.endswith("No failures.")
     masked = str(check_team_env(MaskedEnv, {"n_agents": 3}, n_steps=20))
     assert "masks: of 2 agents, 33% of the actions are possible" in masked
     assert "2 episodes of 7 to 7 steps, 0 terminated and 2 truncated" in masked
@@ -343,3 +344,16 @@ def test_a_report_counts_its_failures():
     assert str(report) == "ok    a: fine\nNo failures."
     report.add("b", "FAIL", "bad")
     assert str(report).endswith("FAIL  b: bad\n1 failure.") and [finding.topic for finding in report.failures] == ["b"]
+
+
+class Generating(MixedEnv):
+    """Environment that holds what is no data."""
+
+    def reset(self, seed=None, options=None):
+        self.numbers = (i for i in range(3))
+        return super().reset(seed, options)
+
+
+def test_a_state_that_cannot_be_saved_is_said():
+    text = str(check_team_env(Generating, n_steps=20))
+    assert "a run begins new episodes at each checkpoint, since" in text and "numbers" in text
