@@ -146,9 +146,14 @@ class RunRecord:
 
     @contextmanager
     def failures(self) -> Iterator[None]:
-        """Record a failure of the lines in the context, unless they have recorded how they ended, and raise it on."""
+        """Record what ends the lines in the context, unless they have recorded how they ended, and raise it on."""
         try:
             yield
+        except KeyboardInterrupt as error:
+            # Before the training had begun, so that there is nothing to save
+            if self.content["status"] == "running":
+                self.finish("interrupted", signal=getattr(error, "signal_name", "SIGINT"))
+            raise
         except BaseException as error:
             if self.content["status"] == "running":
                 self.finish("failed", error=cause(error))
@@ -197,10 +202,11 @@ def find_team(run: str | os.PathLike[str], flag: str, tells: bool = True) -> Pat
     if not os.path.isdir(path):
         raise ConfigError(f"{flag}: no file or folder {str(path)!r}. Give a run's folder or a saved team's zip.")
     is_run = (path / RECORD).is_file()
-    status = read_record(path).get("status") if is_run else None
-    checkpoint = None
-    # An earlier part of a run that goes on may have left a team
-    if is_run and (status == "running" or not (path / TEAM).is_file()):
+    record = read_record(path) if is_run else {}
+    status, checkpoint = record.get("status"), None
+    # An earlier part of a run that goes on may have left a team. What ended before it began to learn has saved none
+    has_saved = status == "finished" or (status in UNFINISHED and "timesteps" in record)
+    if is_run and not (has_saved and (path / TEAM).is_file()):
         checkpoint = next(whole_checkpoints(path), None)
     if checkpoint is None and not (path / TEAM).is_file():
         # Not deeper: checkpoints lie one folder below, and the folder may be any

@@ -1,5 +1,6 @@
 """Kills of a run at drawn moments, until it has finished."""
 
+import contextlib
 import random
 import shutil
 import signal
@@ -37,6 +38,18 @@ def undisturbed(launcher: Launcher, combination: Combination, folder: Path, seed
     run = run_in(folder)
     assert run is not None
     return run, seconds
+
+
+def has_begun(training: Training, folder: Path) -> bool | None:
+    """Return True once a process has a checkpoint and holds its run's folder, or has ended, otherwise None."""
+    if training.poll() is not None:
+        return True
+    if (run := run_in(folder)) is None or not has_checkpoint(folder):
+        return None
+    with contextlib.suppress(FileNotFoundError):
+        if f"process {training.pid} " in (run / ".lock").read_text():
+            return True
+    return None
 
 
 class Killed:
@@ -102,16 +115,7 @@ class Killed:
 
     def _wait_and_kill(self, training: Training, seconds: float, while_saving: bool) -> bool:
         """Return whether it has been killed before it ended by itself."""
-
-        def started() -> bool | None:
-            run = run_in(self._folder)
-            if training.poll() is not None:
-                return True
-            # A resume says so in the record once it has put everything back
-            begun = run is not None and (run / ".lock").exists() and f"process {training.pid} " in (run / ".lock").read_text()
-            return (begun and has_checkpoint(self._folder)) or None
-
-        assert wait_for(started, PATIENCE), training.output
+        assert wait_for(lambda: has_begun(training, self._folder), PATIENCE), training.output
         moment = time.monotonic() + seconds
         while training.poll() is None and time.monotonic() < moment:
             time.sleep(0.001)

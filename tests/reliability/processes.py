@@ -23,15 +23,17 @@ class Launcher:
 
     :param folder: Where their outputs go
     :param modules: What workers need beside the package
+    :param temporary: Folder for temporary files; None for the system's
     """
 
-    def __init__(self, folder: Path, *modules: str):
+    def __init__(self, folder: Path, *modules: str, temporary: Path | None = None):
         self._folder = folder
+        self._environ = _ENVIRON if temporary is None else {**_ENVIRON, "TMPDIR": str(temporary)}
         self._count = 0
         self._warm = subprocess.Popen(
             [sys.executable, "-m", "tests.reliability.warm", *modules],
             cwd=ROOT,
-            env=_ENVIRON,
+            env=self._environ,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -64,7 +66,7 @@ class Launcher:
             process = subprocess.Popen(
                 [sys.executable, "-m", "sb3_belief", *words],
                 cwd=ROOT,
-                env=_ENVIRON,
+                env=self._environ,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -109,6 +111,10 @@ class Training:
     def wait(self, seconds: float) -> int | None:
         """Wait for its end, and return its exit status; None if it has not ended then."""
         return wait_for(self.poll, seconds)
+
+    def workers(self) -> list[int]:
+        """Return its workers as far as they live, if another process forks them."""
+        return [pid for pid, parent, _ in living_processes() if self._server is not None and parent == self._server]
 
     def descendants(self) -> list[int]:
         """Return the processes that it has started, and their own, as far as they live."""

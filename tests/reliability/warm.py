@@ -61,6 +61,8 @@ def _start(words: list[str], output: str, limit: int | None = None) -> int:
         status = 1
         try:
             status = _become(words, output, limit)
+            # As at first, when nothing of Python's handles it
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             # As at the end of any process of multiprocessing: workers are ended
             multiprocessing.util._exit_function()  # type: ignore[attr-defined]
         finally:

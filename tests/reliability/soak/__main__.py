@@ -1,0 +1,102 @@
+"""
+Disturb random trainings for as long as wanted, and check that nothing is lost.
+
+    make soak
+    make soak SOAK_MINUTES=20 SOAK_SEED=3
+
+The exit status is 1 if an invariant did not hold.
+"""
+
+import argparse
+import contextlib
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.reliability.processes import Launcher
+from tests.reliability.soak.memory import LongTraining
+from tests.reliability.soak.report import Report
+from tests.reliability.soak.runs import Soak
+
+_DISK_SIZE = "24m"
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path) -> Iterator[Path | None]:
+    """Mount a small file system, where that is permitted."""
+    folder.mkdir()
+    try:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={_DISK_SIZE}", "tmpfs", folder], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        yield None
+        return
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=False)
+
+
+def soak(minutes: float, seed: int, folder: Path) -> Report:
+    """
+    Disturb trainings.
+
+    :param minutes: For how long
+    :param seed: Seed of everything that is drawn
+    :param folder: A new folder for all that is written
+    :return: What was found
+    """
+    report = Report(seed)
+    start = time.monotonic()
+    temporary = folder / "tmp"
+    for path in (folder / "outputs", temporary):
+        path.mkdir()
+    launcher = Launcher(folder / "outputs", "tests.reliability.ordered_env", temporary=temporary)
+    with small_disk(folder / "disk") as disk, contextlib.closing(launcher):
+        if disk is None:
+            report.notes["no small disk could be mounted"] += 1
+        long = LongTraining(launcher, folder / "long")
+        runs = Soak(launcher, folder, disk, random.Random(seed), report)
+        while time.monotonic() - start < 60 * minutes:
+            runs.run_one()
+            long.sample()
+            report.minutes = (time.monotonic() - start) / 60
+            faults = sum(report.faults.values())
+            print(f"{report.minutes:5.1f} min: {report.runs} runs, {faults} faults, {len(report.violations)} violations", flush=True)
+        long.end(report)
+    left = [str(path) for path in temporary.iterdir()]
+    report.check("no temporary file is left", not left, f"{left}")
+    return report
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=float(os.environ.get("SOAK_MINUTES", 60)), help="how long")
+    parser.add_argument("--seed", type=int, default=int(os.environ.get("SOAK_SEED", 0)), help="seed of all that is drawn")
+    parser.add_argument("--folder", type=Path, help="new folder for the runs, which stays; if left out, a temporary one")
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="page into which the tables are written")
+    args = parser.parse_args()
+    folder = args.folder or Path(tempfile.mkdtemp(prefix="soak-"))
+    folder.mkdir(exist_ok=True)
+    report = soak(args.minutes, args.seed, folder)
+    print(f"\n{report.to_markdown()}")
+    for text in report.violations:
+        print(f"VIOLATION: {text}")
+    (folder / "soak.json").write_text(report.to_json())
+    if args.write is not None:
+        report.write_into(args.write)
+    if args.folder is None and not report.violations:
+        shutil.rmtree(folder)
+    else:
+        print(f"The runs are in {folder}")
+    return 1 if report.violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
