@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -17,7 +18,7 @@ class OrderedEnv(ParallelEnv):
     :param orders: A file. The copy that finds it first takes it away and does what it says: "die", "hang" or "raise"
     """
 
-    metadata = {"name": "ordered_v0"}
+    metadata: ClassVar = {"name": "ordered_v0"}
 
     def __init__(self, orders=None):
         self.orders = orders

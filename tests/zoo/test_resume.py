@@ -14,9 +14,9 @@ import pytest
 import yaml
 
 import sb3_belief
-from sb3_belief.team import Team
+from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.zoo.cli import main, train_main
-from sb3_belief.zoo.endings import SignalCheck
+from sb3_belief.zoo.endings import Interrupted, SignalCheck
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.resume import resume_config
 from sb3_belief.zoo.run_folder import find_team, whole_checkpoints
@@ -334,6 +334,24 @@ def test_others_take_the_newest_checkpoint_of_an_unfinished_run(tmp_path, capsys
     capsys.readouterr()
     assert find_team(run, "enjoy") == run / "checkpoints" / "team_160_steps.zip"
     assert f"{newest} is damaged" in capsys.readouterr().err
+
+
+def test_a_signal_before_the_training_begins_is_no_failure(tmp_path, undisturbed, monkeypatch, capsys):
+    run = stopped(tmp_path, 300)
+
+    def start_monitor(*_, **__):
+        raise Interrupted(15)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(TeamVecEnv, "start_monitor", start_monitor)
+        assert train_main(["--resume", str(run)]) == 143
+    record = record_of(run)
+    assert (record["status"], record["signal"]) == ("interrupted", "SIGTERM")
+    assert "error" not in record and "timesteps" not in record
+    # The team is that of an earlier end
+    assert find_team(run, "enjoy") == run / "checkpoints" / "team_240_steps.zip"
+    assert train_main(["--resume", str(run)]) == 0
+    check_same_run(run, undisturbed)
 
 
 def test_i_of_an_unfinished_run_begins_a_new_one(tmp_path, capsys):

@@ -67,7 +67,10 @@ def soak(minutes: float, seed: int, folder: Path) -> Report:
             long.sample()
             report.minutes = (time.monotonic() - start) / 60
             faults = sum(report.faults.values())
-            print(f"{report.minutes:5.1f} min: {report.runs} runs, {faults} faults, {len(report.violations)} violations", flush=True)
+            print(
+                f"{report.minutes:5.1f} min: {report.runs} runs, {faults} faults, {len(report.violations)} violations",
+                flush=True,
+            )
         long.end(report)
     left = [str(path) for path in temporary.iterdir()]
     report.check("no temporary file is left", not left, f"{left}")

@@ -157,4 +157,3 @@ def damage_newest(checkpoints: Path, rng: random.Random) -> tuple[str, Path] | N
         content[start + rng.randrange(member.compress_size)] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
     return kind, path
-

@@ -192,7 +192,8 @@ class _Run:
         return now["status"] == "running" and (before is None or len(now["resumed"]) > len(before.get("resumed", [])))
 
     def _check_damaged(self, training: Training) -> None:
-        """Check that a damaged checkpoint was not taken; a killed process may not have come to it, but then the next one does."""
+        """Check that a damaged checkpoint was not taken."""
+        # A killed process may not have come to it, but then the next one does
         if self._damaged is None:
             return
         said = any(f"{self._damaged} {text}" in training.output for text in ("is damaged", "cannot be loaded"))
