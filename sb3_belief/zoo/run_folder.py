@@ -205,8 +205,8 @@ def find_team(run: str | os.PathLike[str], flag: str, tells: bool = True) -> Pat
     record = read_record(path) if is_run else {}
     status, checkpoint = record.get("status"), None
     # An earlier part of a run that goes on may have left a team. What ended before it began to learn has saved none
-    has_saved = status == "finished" or (status in UNFINISHED and "timesteps" in record)
-    if is_run and not (has_saved and (path / TEAM).is_file()):
+    saved_none = status == "running" or (status in UNFINISHED and "timesteps" not in record)
+    if is_run and (saved_none or not (path / TEAM).is_file()):
         checkpoint = next(whole_checkpoints(path), None)
     if checkpoint is None and not (path / TEAM).is_file():
         # Not deeper: checkpoints lie one folder below, and the folder may be any

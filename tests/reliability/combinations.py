@@ -99,9 +99,9 @@ def check_equal_to(run: Path, undisturbed: Path) -> int:
     mine, theirs = (Team.load(folder / "team.zip") for folder in (run, undisturbed))
     assert mine.num_timesteps == theirs.num_timesteps
     for agent, model in theirs.agents.items():
-        one, other = mine.agents[agent].get_parameters(), model.get_parameters()
-        assert any("optimizer" in name for name in other)
-        assert _equal(one, other), f"{agent}: {[name for name in other if not _equal(one[name], other[name])]}"
+        found, expected = mine.agents[agent].get_parameters(), model.get_parameters()
+        assert any("optimizer" in name for name in expected)
+        assert _equal(found, expected), f"{agent}: {[key for key in expected if not _equal(found[key], expected[key])]}"
     assert mine._agents.statistics.keys() == theirs._agents.statistics.keys()
     for agent, statistics in theirs._agents.statistics.items():
         for name in ("obs_rms", "ret_rms", "returns"):

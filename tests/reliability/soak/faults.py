@@ -35,7 +35,7 @@ class Fault:
 
 
 def _times(signum: int, times: int) -> Callable[[Training, Path], bool]:
-    def send(training: Training, _: Path) -> bool:
+    def send(training: Training, run: Path) -> bool:
         # To the group, as a terminal or a scheduler does
         sent = training.send(signum)
         for _ in range(times - 1):

@@ -189,7 +189,7 @@ class _Run:
 
     def _goes_on(self, before: dict[str, Any] | None) -> bool:
         now = record_of(self._run)
-        return now["status"] == "running" and (before is None or len(now["resumed"]) > len(before.get("resumed", [])))
+        return now["status"] == "running" and (before is None or len(now.get("resumed", [])) > len(before.get("resumed", [])))
 
     def _check_damaged(self, training: Training) -> None:
         """Check that a damaged checkpoint was not taken."""
