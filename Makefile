@@ -19,8 +19,10 @@ PYTEST_ARGS ?=
 PYTEST_JOBS ?= auto
 CONFORMANCE_ARGS ?=
 BENCH_ARGS ?=
+SOAK_MINUTES ?= 60
+SOAK_SEED ?= 0
 
-.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 pytest conformance bench bench-peers docs package \
+.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 pytest conformance soak bench bench-peers docs package \
 	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -53,6 +55,10 @@ pytest: test
 conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our algorithms in place of theirs
 	$(BIN)/python -m tests.conformance.fetch
 	$(BIN)/python -m tests.conformance.run $(CONFORMANCE_ARGS)
+
+# the page must have the two marks between which the tables stand
+soak: $(STAMP)  ## disturb random trainings for an hour (or SOAK_MINUTES), into the table of docs/reliability.md
+	$(BIN)/python -m tests.reliability.soak --minutes $(SOAK_MINUTES) --seed $(SOAK_SEED) --write docs/reliability.md
 
 bench: $(STAMP)  ## measure speed and memory (20 minutes), into benchmarks/out/bench.json
 	$(BIN)/python -m benchmarks.bench $(BENCH_ARGS)

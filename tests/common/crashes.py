@@ -42,7 +42,7 @@ class Disk:
                     elif kind == "rename":
                         files[more[0]] = names.pop(name)
                     else:
-                        names.pop(name)
+                        (names if name in names else files).pop(name)
                 yield files | names
 
     def _contents(self, steps, node):

@@ -9,7 +9,6 @@ The exit status is 1 if an invariant did not hold.
 
 import argparse
 import contextlib
-import os
 import random
 import shutil
 import subprocess
@@ -62,16 +61,14 @@ def soak(minutes: float, seed: int, folder: Path) -> Report:
             report.notes["no small disk could be mounted"] += 1
         long = LongTraining(launcher, folder / "long")
         runs = Soak(launcher, folder, disk, random.Random(seed), report)
-        while time.monotonic() - start < 60 * minutes:
-            runs.run_one()
-            long.sample()
-            report.minutes = (time.monotonic() - start) / 60
-            faults = sum(report.faults.values())
-            print(
-                f"{report.minutes:5.1f} min: {report.runs} runs, {faults} faults, {len(report.violations)} violations",
-                flush=True,
-            )
-        long.end(report)
+        try:
+            while time.monotonic() - start < 60 * minutes:
+                runs.run_one()
+                long.sample()
+                report.minutes = (time.monotonic() - start) / 60
+                print(f"{report.minutes:5.1f} min: {report.summary()}", flush=True)
+        finally:
+            long.end(report)
     left = [str(path) for path in temporary.iterdir()]
     report.check("no temporary file is left", not left, f"{left}")
     return report
@@ -80,8 +77,8 @@ def soak(minutes: float, seed: int, folder: Path) -> Report:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=float(os.environ.get("SOAK_MINUTES", 60)), help="how long")
-    parser.add_argument("--seed", type=int, default=int(os.environ.get("SOAK_SEED", 0)), help="seed of all that is drawn")
+    parser.add_argument("--minutes", type=float, default=60.0, help="how long")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all that is drawn")
     parser.add_argument("--folder", type=Path, help="new folder for the runs, which stays; if left out, a temporary one")
     parser.add_argument("--write", type=Path, metavar="PAGE", help="page into which the tables are written")
     args = parser.parse_args()

@@ -44,6 +44,11 @@ class Report:
             print(f"VIOLATION: {invariant}: {detail}", flush=True)
         return bool(holds)
 
+    def summary(self) -> str:
+        """Return the totals, on a line."""
+        counts = (self.runs, sum(self.faults.values()), sum(self.checks.values()), len(self.violations))
+        return "{} runs, {} faults, {:,} checks, {} violations".format(*counts)
+
     def to_json(self) -> str:
         """Return everything as JSON."""
         return json.dumps(asdict(self), indent=2)
@@ -52,8 +57,7 @@ class Report:
         """Return the tables."""
         lines = [
             f"{self.minutes:.0f} minutes with seed {self.seed} on {platform.system()}, {os.cpu_count()} cores, Python"
-            f" {platform.python_version()}: {self.runs} runs, {sum(self.faults.values())} faults,"
-            f" {sum(self.checks.values())} checks, **{len(self.violations)} violations**.",
+            f" {platform.python_version()}: {self.summary()}.",
             "",
             "| fault | times |",
             "|---|---|",
