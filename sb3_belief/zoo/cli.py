@@ -214,8 +214,8 @@ def _train(args: argparse.Namespace, command: list[str]) -> int:
     return train(config, options).exit_status
 
 
-#: Flags that may be given with --resume, since they do not change what is learned
-_WITH_RESUME = ("verbose", "device", "jobs", "num_threads", "progress")
+#: Flags that may be given with --resume, since they do not change what is learned (--on-nan: before there is a nan)
+_WITH_RESUME = ("verbose", "device", "jobs", "num_threads", "on_nan", "progress")
 
 
 def _resume(args: argparse.Namespace, command: list[str]) -> int:
@@ -225,8 +225,8 @@ def _resume(args: argparse.Namespace, command: list[str]) -> int:
     if refused:
         raise ConfigError(
             f"{', '.join(refused)}: with --resume a run goes on with the settings that it had. Allowed with it: --until,"
-            " --verbose, --device, --jobs, --num-threads, -P, --allow-package, --trust. Other settings: -i, which begins a new"
-            " run."
+            " --verbose, --device, --jobs, --num-threads, --on-nan, -P, --allow-package, --trust. Other settings: -i, which"
+            " begins a new run."
         )
     from sb3_belief.zoo.continuation import Continuation, resume
 

@@ -1,6 +1,6 @@
 """The running statistics of a normalised agent, which one observation or reward that is not finite spoils for good."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -38,12 +38,6 @@ def bad_statistics(statistics: VecNormalize | None) -> list[str]:
     ]
 
 
-class _Moments(NamedTuple):
-    mean: np.ndarray
-    var: np.ndarray
-    n: float
-
-
 class KeptStatistics:
     """
     Keeps the last finite statistics of an agent.
@@ -53,13 +47,17 @@ class KeptStatistics:
 
     def __init__(self, statistics: Any):
         self._statistics = statistics
-        self._kept: dict[str, _Moments] = {}
+        self._kept: dict[str, tuple[np.ndarray, np.ndarray, float]] = {}
+
+    def bad(self) -> list[str]:
+        """Return the names of those that are not finite now."""
+        return bad_statistics(self._statistics)
 
     def keep(self) -> None:
         """Keep the statistics as they are, if they are finite."""
-        if self._statistics is not None and not bad_statistics(self._statistics):
+        if self._statistics is not None and not self.bad():
             self._kept = {
-                name: _Moments(np.copy(each.mean), np.copy(each.var), each.count)
+                name: (np.copy(each.mean), np.copy(each.var), each.count)
                 for name, each in running_means(self._statistics).items()
             }
 
@@ -69,11 +67,11 @@ class KeptStatistics:
 
         :return: The names of those that were not
         """
-        bad = bad_statistics(self._statistics)
+        bad = self.bad()
         if bad and self._kept:
             for name, each in running_means(self._statistics).items():
-                moments = self._kept[name]
-                each.mean, each.var, each.count = moments.mean.copy(), moments.var.copy(), moments.n
+                mean, var, each.count = self._kept[name]
+                each.mean, each.var = mean.copy(), var.copy()
             # The sums of the rewards of the episodes at hand, of which the statistics of returns are made
             returns = getattr(self._statistics, "returns", None)
             if returns is not None:
