@@ -20,7 +20,6 @@ _DATA = (
     ("observations", "observations", "scale them down (normalize=True does)"),
     ("next_observations", "observations", "scale them down (normalize=True does)"),
     ("actions", "actions", "they come from the policy: bound or scale the action space"),
-    ("values", "values that the critic predicts", "it has been led astray by earlier updates: lower learning_rate"),
 )
 _LOGS = (
     ("log_std", "the standard deviation of the actions has left all bounds: lower ent_coef or learning_rate"),
@@ -37,7 +36,7 @@ def likely_cause(tensors: ModelTensors, finite: Snapshot | None) -> str:
     :return: A sentence without its full stop
     """
     model = tensors.model
-    for cause in (_of_data(model), _of_step_size(tensors, finite), _of_logarithms(tensors)):
+    for cause in (_of_critic(tensors, finite), _of_data(model), _of_step_size(tensors, finite), _of_logarithms(tensors)):
         if cause is not None:
             return cause
     return (
@@ -60,6 +59,18 @@ def cause_in_rollout(tensors: ModelTensors) -> str | None:
     now = Snapshot()
     now.take(tensors)
     return _of_step_size(tensors, now)
+
+
+def _of_critic(tensors: ModelTensors, finite: Snapshot | None) -> str | None:
+    """Look first for huge values of a critic, since SB3 adds them to the rewards of a rollout where a time limit ends it."""
+    for name, buffer in _buffers(tensors.model):
+        size = _size(getattr(buffer, "values", None))
+        if size is not None and not size < _HUGE_DATA:
+            return _of_step_size(tensors, finite) or (
+                f"the values that the critic predicts in its {name} {_reach(size)}: earlier updates have led it astray, lower"
+                " learning_rate"
+            )
+    return None
 
 
 def _of_data(model: BaseAlgorithm) -> str | None:

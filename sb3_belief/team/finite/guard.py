@@ -207,9 +207,10 @@ class UpdateGuard:
         if self._finite is not None:
             self._finite.put_back(self._tensors)
         spoilt = self._statistics.put_back()
+        whose = "statistics" if spoilt and not values else "loss or parameters"
         cause = _TOO_LARGE if spoilt else likely_cause(self._tensors, self._finite)
         message = (
-            f"Agent {self._agent!r} is no longer finite {found} its update at joint step {steps}"
+            f"Agent {self._agent!r}: {whose} are not finite {found} its update at joint step {steps}"
             f" (n_updates {n_updates}): {what}. Likely cause: {cause}."
         )
         key = values.partition(" is ")[0] if values and error is None else next(iter(bad), type(error).__name__)
