@@ -60,7 +60,7 @@ conformance: $(STAMP)  ## run SB3's and sb3-contrib's own test suites with our a
 soak: $(STAMP)  ## disturb random trainings for an hour (or SOAK_MINUTES), into the table of docs/reliability.md
 	$(BIN)/python -m tests.reliability.soak --minutes $(SOAK_MINUTES) --seed $(SOAK_SEED) --write docs/reliability.md
 
-bench: $(STAMP)  ## measure speed and memory (20 minutes), into benchmarks/out/bench.json
+bench: $(STAMP)  ## measure speed and memory (25 minutes), into benchmarks/out/bench.json
 	$(BIN)/python -m benchmarks.bench $(BENCH_ARGS)
 
 # each of the other libraries has an environment of its own; one that cannot be made is skipped, and its log says why

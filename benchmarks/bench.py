@@ -17,6 +17,7 @@ Parts:
 - ``cores``: two cores against one
 - ``workers``: an environment whose step takes 10 ms, in worker processes (benchmarks/heavy.py)
 - ``finite``: updates with the search for what is not finite, against updates alone (benchmarks/finite.py)
+- ``checkpoints``: learning with the checkpoints that a run has by default, against without (benchmarks/checkpoints.py)
 - ``gpu``: updates on a GPU against the CPU, where there is a GPU
 
 torch uses one thread. Speeds are joint steps (of one copy) per second of CPU time, including that of workers, and per second
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import acting, cores, finite, gpu, growth, heavy, memory
+from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory
 from benchmarks.measure import Loop, Sample, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
@@ -108,6 +109,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "cores": cores.run,
     "workers": heavy.run,
     "finite": finite.run,
+    "checkpoints": checkpoints.run,
     "gpu": gpu.run,
 }
 

@@ -27,6 +27,8 @@ BARS: dict[str, tuple[str, float]] = {
     "checks_dqn": ("<=", 1.03),
     "checks_sac": ("<=", 1.02),
     "checks_ppo": ("<=", 1.02),
+    "checkpoints_vs_none": (">=", 0.97),
+    "seconds_of_a_checkpoint": ("<", 0.5),
 }
 #: The same of peak memory, in MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}

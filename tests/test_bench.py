@@ -19,7 +19,7 @@ AGENT_STEPS = 32
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
     out = tmp_path_factory.mktemp("bench") / "out" / "bench.json"
-    bench.main(["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "finite", "--out", str(out)])
+    bench.main(["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "--out", str(out)])
     return json.loads(Path(out).read_text())
 
 
@@ -49,6 +49,7 @@ def test_steps_are_counted_as_they_were_done(written):
     assert junction_rows == [[4 * 8]] * 2
     together = [steps for (part, _), steps in rows.items() if part == "together"]
     assert together == [[8 * 8]] * 4 + [[4 * 8]] * 4
+    assert rows["checkpoints", "none"] == rows["checkpoints", "as by default"] == [4 * 8]
     if cores() > 1:
         assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [3 * 4 * 8]
         assert rows["cores", "2 teams"] == [2 * 3 * 4 * 8]
