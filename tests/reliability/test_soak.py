@@ -1,8 +1,10 @@
 """What a soak counts and injects. The soak itself runs for an hour: ``make soak``."""
 
+import json
 import os
 import random
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from sb3_belief.team.checkpoints import checkpoint_files
 from sb3_belief.zoo.run_folder import whole_checkpoints
 from tests.reliability.ordered_env import OrderedEnv
-from tests.reliability.soak.__main__ import soak
+from tests.reliability.soak.__main__ import check_temporary_files, soak
 from tests.reliability.soak.faults import damage_newest
 from tests.reliability.soak.memory import growth
 from tests.reliability.soak.report import BEGIN, END, Report
@@ -44,6 +46,29 @@ def test_the_tables_take_the_place_of_those_before(tmp_path):
     page.write_text("# Page\n")
     with pytest.raises(ValueError, match="once each"):
         filled().write_into(page)
+
+
+def test_a_report_is_json_too():
+    found = json.loads(filled().to_json())
+    assert found["faults"] == {"SIGTERM": 2, "SIGKILL": 1} and found["violations"] == ["the team loads: run 2"]
+
+
+def test_teams_that_found_no_other_place_are_no_leftovers(tmp_path):
+    temporary, outputs = tmp_path / "tmp", tmp_path / "outputs"
+    for folder in (temporary, outputs):
+        folder.mkdir()
+    _, run = train(tmp_path / "logs", "-n", "80", "--eval-freq", "-1")
+    shutil.copy(run / "team.zip", temporary / "ppo_team.zip")
+    report = Report(0)
+    check_temporary_files(temporary, outputs, report)
+    assert report.violations == ["no temporary file is left: ['ppo_team.zip']"]
+    (outputs / "output_1.txt").write_text(f"The team has been saved as {temporary / 'ppo_team.zip'} instead.\n")
+    report = Report(0)
+    check_temporary_files(temporary, outputs, report)
+    assert not report.violations and report.checks == {"the team loads": 1, "no temporary file is left": 1}
+    (temporary / "ppo_team.zip").write_bytes(b"PK")
+    check_temporary_files(temporary, outputs, report)
+    assert len(report.violations) == 1
 
 
 def test_growth_counts_from_a_moment_on():

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from sb3_belief.team import Team
 from tests.reliability.processes import Launcher
 from tests.reliability.soak.memory import LongTraining
 from tests.reliability.soak.report import Report
@@ -69,9 +70,30 @@ def soak(minutes: float, seed: int, folder: Path) -> Report:
                 print(f"{report.minutes:5.1f} min: {report.summary()}", flush=True)
         finally:
             long.end(report)
-    left = [str(path) for path in temporary.iterdir()]
-    report.check("no temporary file is left", not left, f"{left}")
+    check_temporary_files(temporary, folder / "outputs", report)
     return report
+
+
+def check_temporary_files(temporary: Path, outputs: Path, report: Report) -> None:
+    """
+    Check that in the folder for temporary files nothing is left but teams that found no other place, and that they load.
+
+    :param temporary: The folder
+    :param outputs: Folder of what trainings have printed, which names such teams
+    :param report: Counts
+    """
+    said = "".join(path.read_text(errors="replace") for path in outputs.iterdir())
+    left = []
+    for path in temporary.iterdir():
+        if f"saved as {path} instead" in said:
+            loads = False
+            with contextlib.suppress(Exception):
+                loads = Team.load(path, device="cpu").num_timesteps > 0
+            report.check("the team loads", loads, f"{path}")
+        # torch's own cache
+        elif not path.name.startswith("torchinductor"):
+            left.append(path.name)
+    report.check("no temporary file is left", not left, f"{left}")
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ import os
 import platform
 import re
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,7 @@ class Report:
 
     def to_json(self) -> str:
         """Return everything as JSON."""
-        return json.dumps(asdict(self), indent=2)
+        return json.dumps(vars(self), indent=2)
 
     def to_markdown(self) -> str:
         """Return the tables."""
