@@ -1,9 +1,10 @@
-"""The networks and optimizers of a model, by the paths at which they are found."""
+"""The networks and optimizers of a model, by the paths at which they are found, and the wrappers around its environment."""
 
 from collections.abc import Iterator
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from torch import nn
 
 
@@ -34,3 +35,15 @@ def optimizers_of(model: BaseAlgorithm) -> dict[str, th.optim.Optimizer]:
         for name, value in vars(owner).items()
         if isinstance(value, th.optim.Optimizer)
     }
+
+
+def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
+    """
+    Iterate over SB3 wrappers around an environment.
+
+    :param env: Of a model or a team, if it has one
+    :return: The wrappers, the outermost first
+    """
+    while isinstance(env, VecEnvWrapper):
+        yield env
+        env = env.venv

@@ -26,6 +26,7 @@ from sb3_belief.belief_ppo.cut_returns import CutReturns
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState
 from sb3_belief.common.safe_files.trust import MODEL_PACKAGES, Trust, is_allowed
+from sb3_belief.team.model_parts import wrappers_of
 
 # Parts of a model that its zip or its team saves, and constants
 _NO_STATE = (nn.Module, th.optim.Optimizer, spaces.Space, BaseBuffer, Logger, VecEnv, th.device, str, type)
@@ -63,7 +64,7 @@ def read_agent_state(model: BaseAlgorithm, rng: RngState) -> PlainData:
         "modules": {path: dict(_numbers(module)) for path, module in _modules(model)},
         "noise": {path: matrices for path, matrices in _noise_matrices(model)},
         "buffers": {name: _buffer_state(buffer) for name, buffer in _buffers(model)},
-        "wrappers": [_wrapper_state(wrapper) for wrapper in _wrappers(model.env)],
+        "wrappers": [_wrapper_state(wrapper) for wrapper in wrappers_of(model.env)],
     }
     try:
         return encode(state, _any_module)
@@ -173,12 +174,6 @@ def _first_rows(value: Any, n_rows: int, size: int) -> Any:
     return value[:n_rows] if isinstance(value, np.ndarray) and len(value) == size else value
 
 
-def _wrappers(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
-    while isinstance(env, VecEnvWrapper):
-        yield env
-        env = env.venv
-
-
 def _wrapper_state(wrapper: VecEnvWrapper) -> dict[str, Any]:
     settings = inspect.signature(type(wrapper).__init__).parameters
     return {
@@ -206,7 +201,7 @@ def _put_back(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
             # A replay buffer may be most of the memory: its arrays are filled, not replaced
             if not _written_into(vars(vars(model)[name]).get(key), value):
                 _put_into(vars(model)[name], {key: value})
-    wrappers = list(_wrappers(model.env))
+    wrappers = list(wrappers_of(model.env))
     if len(saved["wrappers"]) != len(wrappers):
         raise ValueError(f"The saved agent had {len(saved['wrappers'])} wrappers around its environment, not {len(wrappers)}.")
     for wrapper, values in zip(wrappers, saved["wrappers"], strict=True):

@@ -2,12 +2,12 @@
 
 import inspect
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_belief.team.model_parts import wrappers_of
 from sb3_belief.team.own_code import callbacks_within
 
 # What ties a callback to a training, and what it was told by it
@@ -99,7 +99,7 @@ def wrapper_states(env: VecEnv) -> list[dict[str, Any]]:
     """
     return [
         {name: value for name, value in vars(wrapper).items() if _is_counted(wrapper, name, value)}
-        for wrapper in _wrappers(env)
+        for wrapper in wrappers_of(env)
     ]
 
 
@@ -111,18 +111,12 @@ def restore_wrappers(env: VecEnv, states: list[dict[str, Any]]) -> None:
     :param states: As :func:`wrapper_states` returned them
     :raises ValueError: If there are other wrappers
     """
-    wrappers = list(_wrappers(env))
+    wrappers = list(wrappers_of(env))
     if len(wrappers) != len(states):
         raise ValueError(f"The saved team had {len(states)} SB3 wrappers around its environment, not {len(wrappers)}.")
     for wrapper, state in zip(wrappers, states, strict=True):
         own = vars(wrapper)
         own.update({name: value for name, value in state.items() if name in own and _is_counted(wrapper, name, own[name])})
-
-
-def _wrappers(env: VecEnv) -> Iterator[VecEnv]:
-    while isinstance(env, VecEnvWrapper):
-        yield env
-        env = env.venv
 
 
 def _is_counted(wrapper: VecEnv, name: str, value: Any) -> bool:

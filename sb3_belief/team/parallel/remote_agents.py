@@ -13,9 +13,10 @@ from sb3_belief.common.processes import uninterrupted
 from sb3_belief.common.rng import RngState
 from sb3_belief.common.sent_errors import rebuilt_error
 from sb3_belief.team.lockstep.joint_loop import JointLoop
+from sb3_belief.team.model_parts import wrappers_of
 from sb3_belief.team.parallel.messages import Message, dumps, loads
 from sb3_belief.team.parallel.model_state import pack, write_state
-from sb3_belief.team.parallel.worker_server import AgentPayload, Command, state_of, wrappers_of
+from sb3_belief.team.parallel.worker_server import AgentPayload, Command, state_of
 from sb3_belief.team.parallel.workers import Workers
 from sb3_belief.vec_env.agent_vec_env import AgentTransition
 from sb3_belief.vec_env.team_vec_env import TeamObs

@@ -19,6 +19,7 @@ from sb3_belief.common.sent_errors import sent_error
 from sb3_belief.team.batched_forward import batched_forwards
 from sb3_belief.team.exact.agent_state import write_agent_state
 from sb3_belief.team.lockstep.scheduler import AgentTask
+from sb3_belief.team.model_parts import wrappers_of
 from sb3_belief.team.own_code import runs_own_code
 from sb3_belief.team.parallel.group_scheduler import GroupScheduler
 from sb3_belief.team.parallel.messages import Message, dumps, loads, receive, send
@@ -60,18 +61,6 @@ class Command(NamedTuple):
 _OWN = ("open", "end_rollouts", "restore", "sync", "close")
 # Attributes of a wrapper that belong to the process it is in
 _OF_THE_PROCESS = ("venv", "class_attributes")
-
-
-def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
-    """
-    Iterate over the wrappers around an agent's environment.
-
-    :param env: Environment of a model
-    :return: The wrappers, the outermost first
-    """
-    while isinstance(env, VecEnvWrapper):
-        yield env
-        env = env.venv
 
 
 def state_of(wrapper: VecEnvWrapper) -> dict[str, Any]:
