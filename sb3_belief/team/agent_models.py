@@ -90,7 +90,7 @@ def agent_seed(seed: int, index: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1)[0])
 
 
-def env_seed(seed: int, purpose: int = 0) -> int:
+def env_seed(seed: int, purpose: int = 0, step: int | None = None) -> int:
     """
     Return the seed of a team's environment, whose copy i then has this seed + i, as in SB3.
 
@@ -98,11 +98,14 @@ def env_seed(seed: int, purpose: int = 0) -> int:
     apart.
 
     :param seed: The team's seed
-    :param purpose: 0 for training, 1 for an environment of evaluations that is to have other episodes
+    :param purpose: 0 for training, 1 for an environment of evaluations that is to have other episodes, 2 for episodes that
+        begin with a checkpoint
+    :param step: The joint step at which the environment is seeded, for one that is seeded again; None before the first
     :return: The environment's seed, in [0, 2**30)
     """
-    # Spawn keys of two numbers, since those of the agents have one
-    return int(np.random.SeedSequence(seed, spawn_key=(0, purpose)).generate_state(1)[0] >> 2)
+    # Spawn keys of two numbers or three, since those of the agents have one
+    key = (0, purpose) if step is None else (0, purpose, step)
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0] >> 2)
 
 
 def team_rng(seed: int | None) -> RngState:

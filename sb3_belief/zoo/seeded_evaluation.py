@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import numpy as np
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_belief.common.continued_files import sync_file
+from sb3_belief.team.agent_models import env_seed
 
 
 class SeededEvalCallback(EvalCallback):
@@ -27,9 +27,7 @@ class SeededEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         if not (self.eval_freq > 0 and self.n_calls % self.eval_freq == 0):
             return super()._on_step()
-        # Spawn keys of three numbers, since those of other environments have two
-        seeds = np.random.SeedSequence(self.seed, spawn_key=(0, 1, self.num_timesteps))
-        self.eval_env.seed(int(seeds.generate_state(1)[0] >> 2))
+        self.eval_env.seed(env_seed(self.seed, purpose=1, step=self.num_timesteps))
         env: Any = self.eval_env.unwrapped
         env.reports_success = env.reports_success or self.reports_success
         continues = super()._on_step()

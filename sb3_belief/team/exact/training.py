@@ -18,7 +18,7 @@ from sb3_belief.common.file_names import file_name
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.common.safe_files.trust import UNTRUSTED
-from sb3_belief.team.agent_models import AgentModels
+from sb3_belief.team.agent_models import AgentModels, env_seed
 from sb3_belief.team.exact.agent_state import read_agent_state, write_agent_state
 from sb3_belief.team.exact.counted import callback_states, have_classes, restore_callbacks, restore_wrappers, wrapper_states
 from sb3_belief.team.lockstep.joint_loop import JointLoop
@@ -134,14 +134,12 @@ class ExactTraining:
                     "The state of the environment cannot be saved, so that all its copies begin new episodes with each exact"
                     f" checkpoint, seeded by the team's seed and the step. {error}"
                 )
-        seed = int(
-            np.random.SeedSequence(self._team.seed or 0, spawn_key=(0, 2, self._team.num_timesteps)).generate_state(1)[0]
-        )
-        loop.env.seed(seed >> 2)
+        seed = env_seed(self._team.seed or 0, purpose=2, step=self._team.num_timesteps)
+        loop.env.seed(seed)
         loop.reset()
         for model in models.values():
             _begin_episodes(model)
-        return {"seed": seed >> 2}, True
+        return {"seed": seed}, True
 
     def needs_reset(self, loop: JointLoop) -> bool:
         """
