@@ -78,9 +78,3 @@ class BatchedVecEnv(TeamVecEnv):
             self.batched_game.set_state(copy, state)
         self._zero_episode_sums()
         return self._observe()
-
-    def _copies_state(self) -> list[dict[str, Any]]:
-        return self.get_state()
-
-    def _set_copies_state(self, state: Sequence[dict[str, Any]]) -> None:
-        self.set_state(state)

@@ -335,11 +335,13 @@ class TeamVecEnv(VecEnv):
 
     def _copies_state(self) -> Any:
         """Return what decides how the copies go on, as plain data."""
-        raise NotPlainError(f"{type(self).__name__} does not say in which state its copies are.")
+        if not (hasattr(self, "get_state") and hasattr(self, "set_state")):
+            raise NotPlainError(f"{type(self).__name__} has no get_state() and set_state().")
+        return self.get_state()
 
     def _set_copies_state(self, state: Any) -> None:
         """Restore what ``_copies_state`` returned."""
-        raise NotImplementedError
+        self.set_state(state)  # type: ignore[attr-defined]
 
     # Checks
 

@@ -133,12 +133,6 @@ class SmaxVecEnv(TeamVecEnv):
         self._zero_episode_sums()
         return self._observe()
 
-    def _copies_state(self) -> list[dict[str, Any]]:
-        return self.get_state()
-
-    def _set_copies_state(self, state: Sequence[dict[str, Any]]) -> None:
-        self.set_state(state)
-
     def get_images(self) -> list[np.ndarray | None]:
         """
         Return a picture of each copy.
