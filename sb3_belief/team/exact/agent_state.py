@@ -18,7 +18,6 @@ from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from torch import nn
 
@@ -61,7 +60,7 @@ def read_agent_state(model: BaseAlgorithm, rng: RngState) -> PlainData:
         # Off-policy algorithms explore by sampling from it
         "action_space": model.action_space._np_random,
         "attributes": _attributes(model),
-        "modules": {path: dict(_numbers(module)) for path, module in _modules(model)},
+        "modules": {path: dict(_numbers(module)) for path, module in model.policy.named_modules()},
         "noise": {path: matrices for path, matrices in _noise_matrices(model)},
         "buffers": {name: _buffer_state(buffer) for name, buffer in _buffers(model)},
         "wrappers": [_wrapper_state(wrapper) for wrapper in wrappers_of(model.env)],
@@ -125,10 +124,6 @@ def _attributes(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
-def _modules(model: BaseAlgorithm) -> Iterator[tuple[str, nn.Module]]:
-    yield from model.policy.named_modules()
-
-
 def _numbers(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """Iterate over numbers and arrays that a module holds besides its parameters, and over buffers that are not saved."""
     for name, value in vars(module).items():
@@ -141,7 +136,7 @@ def _numbers(module: nn.Module) -> Iterator[tuple[str, Any]]:
 
 def _noise_matrices(model: BaseAlgorithm) -> Iterator[tuple[str, dict[str, th.Tensor]]]:
     """Iterate over the noise with which gSDE explores until it draws anew."""
-    for path, module in _modules(model):
+    for path, module in model.policy.named_modules():
         distribution = getattr(module, "action_dist", None)
         if isinstance(distribution, StateDependentNoiseDistribution) and hasattr(distribution, _NOISE_MATRICES[0]):
             yield path, {name: getattr(distribution, name).detach() for name in _NOISE_MATRICES}
@@ -188,12 +183,12 @@ def _put_back(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
     model.action_space._np_random = saved["action_space"]
     _put_into(model, saved["attributes"])
     for path, numbers in saved["modules"].items():
-        module = recursive_getattr(model.policy, path) if path else model.policy
+        module = model.policy.get_submodule(path)
         _put_into(module, {name: value for name, value in numbers.items() if name not in module._buffers})
         for name in numbers.keys() & module._buffers.keys():
             module._buffers[name] = numbers[name]
     for path, matrices in saved["noise"].items():
-        distribution = (recursive_getattr(model.policy, path) if path else model.policy).action_dist
+        distribution = model.policy.get_submodule(path).action_dist
         for name in _NOISE_MATRICES:
             setattr(distribution, name, matrices[name])
     for name, values in saved["buffers"].items():
