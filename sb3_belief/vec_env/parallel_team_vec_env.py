@@ -283,9 +283,8 @@ class _InProcessVecEnv(DummyVecEnv):
     def _cut(self, copy: int, error: Exception) -> Any:
         """Return the step of a copy that has raised an error in it."""
         obs, info = self._made_anew(copy, int(self.steps_so_far()[copy]) + 1, error)
-        scripted = self.envs[copy].scripted_action_spaces
-        width = sum(map(spaces.flatdim, scripted.values()))
-        return cut_step(copy, self.restarts.last, len(scripted), width, obs, info.get("action_masks"))
+        scripted_spaces = self.envs[copy].scripted_action_spaces
+        return cut_step(copy, self.restarts.last, scripted_spaces, obs, info.get("action_masks"))
 
     def _made_anew(self, copy: int, step: int, cause: Exception, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Make a copy anew and reset it, or raise what has happened to it."""

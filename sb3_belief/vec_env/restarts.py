@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 
 from sb3_belief.vec_env.events import StepRecord, no_flags
 from sb3_belief.vec_env.observation_forms import copied, row_of
@@ -105,7 +106,7 @@ class Restarts:
 
 
 def cut_step(
-    copy: int, last: LastStep, n_scripted: int, scripted_width: int, obs: dict[str, Any], masks: np.ndarray | None
+    copy: int, last: LastStep, scripted_spaces: Mapping[str, spaces.Space], obs: dict[str, Any], masks: np.ndarray | None
 ) -> CutStep:
     """
     Return the step at which an episode broke off, as ``step_and_reset`` would.
@@ -114,8 +115,7 @@ def cut_step(
 
     :param copy: Number of the copy
     :param last: What it returned last
-    :param n_scripted: Number of scripted others
-    :param scripted_width: Width of their actions
+    :param scripted_spaces: Action spaces of the scripted others
     :param obs: First observations of the copy that takes its place
     :param masks: Masks there
     :return: As of ``step_and_reset``
@@ -132,8 +132,9 @@ def cut_step(
             flags.active[:] = active
     flags.truncated[:] = flags.active
     # Nobody has seen what followed
-    visible = np.zeros((n, n - 1 + n_scripted), dtype=bool)
-    scripted = np.zeros(scripted_width, dtype=np.float32) if n_scripted else None
+    visible = np.zeros((n, n - 1 + len(scripted_spaces)), dtype=bool)
+    width = sum(map(spaces.flatdim, scripted_spaces.values()))
+    scripted = np.zeros(width, dtype=np.float32) if scripted_spaces else None
     seen = {agent: copied(row_of(each, copy)) for agent, each in last.observations.items()}
     others = {"TimeLimit.truncated": True, "terminal_observation": seen, "worker_restarted": True}
     return obs, 0.0, True, StepRecord([0.0] * n, flags, visible, masks, scripted), masks, others

@@ -184,9 +184,7 @@ class WorkersVecEnv(SubprocVecEnv):
 
     def _cut_row(self, copy: int, obs: dict[str, Any], masks: np.ndarray | None) -> bytes:
         """Return the answer to a step that broke off."""
-        scripted = self._members[2]
-        width = sum(map(spaces.flatdim, scripted.values()))
-        return RowPacker(*self._members).pack(*cut_step(copy, self.restarts.last, len(scripted), width, obs, masks))
+        return RowPacker(*self._members).pack(*cut_step(copy, self.restarts.last, self._members[2], obs, masks))
 
     def finish_step(self) -> None:
         """Receive and discard the answers to an interrupted command, if there is one."""
