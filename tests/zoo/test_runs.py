@@ -1,4 +1,3 @@
-import csv
 import json
 import os
 from importlib import metadata
@@ -11,6 +10,7 @@ from sb3_belief.envs import TrafficJunction
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
 from sb3_belief.team import Team, make_team_env
 from sb3_belief.zoo.cli import main, train_main
+from tests.zoo.runs import table
 
 EASY = "traffic-junction-easy"
 # small enough for seconds, large enough for two iterations
@@ -34,13 +34,6 @@ def run(tmp_path_factory):
     return folder / "logs" / "ppo" / f"{EASY}_1"
 
 
-def read_csv(path, skip=0):
-    with open(path) as file:
-        for _ in range(skip):
-            next(file)
-        return list(csv.DictReader(file))
-
-
 def test_a_run_writes_its_configuration_and_record(run):
     settings = yaml.safe_load((run / "config.yml").read_text())[EASY]
     assert (settings["n_timesteps"], settings["n_steps"], settings["env_kwargs"]) == (160, 20, {"reward_scale": 0.1})
@@ -51,18 +44,18 @@ def test_a_run_writes_its_configuration_and_record(run):
 
 
 def test_a_run_writes_monitors_of_the_team_and_of_each_agent(run):
-    team = read_csv(run / "monitor.csv", skip=1)
+    team = table(run / "monitor.csv", skip=1)
     assert [row["l"] for row in team] == ["20"] * 8  # 160 joint steps
-    agents = {f"car_{i}": read_csv(run / "agents" / f"car_{i}.monitor.csv", skip=1) for i in range(5)}
+    agents = {f"car_{i}": table(run / "agents" / f"car_{i}.monitor.csv", skip=1) for i in range(5)}
     # the team's reward is the mean of its agents'
     mean = np.mean([[float(row["r"]) for row in rows] for rows in agents.values()], axis=0)
     np.testing.assert_allclose([float(row["r"]) for row in team], mean, atol=1e-5)
     for i in range(5):
-        assert len(read_csv(run / "agents" / f"car_{i}" / "progress.csv")) == 2
+        assert len(table(run / "agents" / f"car_{i}" / "progress.csv")) == 2
 
 
 def test_a_run_writes_progress_evaluations_and_tensorboard(run):
-    assert {int(row["time/total_timesteps"]) for row in read_csv(run / "progress.csv")} >= {80, 160}
+    assert {int(row["time/total_timesteps"]) for row in table(run / "progress.csv")} >= {80, 160}
     with np.load(run / "evaluations.npz") as data:
         assert data["timesteps"].tolist() == [80, 160]
         assert data["results"].shape == data["successes"].shape == (2, 6)
@@ -82,7 +75,7 @@ def test_a_run_writes_teams_that_load(run, name):
 def test_the_same_seed_gives_the_same_run(tmp_path):
     for _ in range(2):
         assert train_tiny("ppo", tmp_path, "-n", "160") == 0
-    first, second = (read_csv(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1) for k in (1, 2))
+    first, second = (table(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1) for k in (1, 2))
     assert [row["r"] for row in first] == [row["r"] for row in second]
 
 
@@ -90,7 +83,7 @@ def test_belief_ppo_runs_in_a_checkout_that_is_elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # configurations are found from any folder, runs are written to this one
     assert train_main(["--env", EASY, "-n", "160", "--eval-freq", "-1", "--verbose", "0", "-params", *TINY["belief_ppo"]]) == 0
     folder = tmp_path / "logs" / "belief_ppo" / f"{EASY}_1"
-    rows = read_csv(folder / "progress.csv")
+    rows = table(folder / "progress.csv")
     assert float(rows[-1]["belief/action_loss"]) > 0
     assert json.loads((folder / "run.json").read_text())["seed"] >= 0  # drawn, and written down
 
@@ -159,7 +152,7 @@ def test_visibility_says_who_is_seen(tmp_path, monkeypatch):
         words = "--allow-package mpe2 --allow-package blindness -params".split()
         assert train_main(["-f", str(tmp_path), *flags, *words, *TINY["belief_ppo"], *settings]) == 0
         folder = max((tmp_path / "belief_ppo").iterdir(), key=lambda path: path.stat().st_mtime_ns)
-        rows = read_csv(folder / "agents" / "agent_0" / "progress.csv")
+        rows = table(folder / "agents" / "agent_0" / "progress.csv")
         assert rows[-1]["belief/visible_fraction"] == name
 
 
@@ -186,7 +179,7 @@ def test_worker_processes_give_the_same_run(tmp_path):
         flags = ["--env", EASY, "-n", "40", "--seed", "3", "-f", str(tmp_path), "--verbose", "0", "--eval-freq", "-1"]
         settings = ["n_envs:2", "n_steps:20", "batch_size:40"]
         assert train_main(["--algo", "ppo", *flags, "--vec-env", vec_env, "-params", *settings]) == 0
-        rows = read_csv(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1)
+        rows = table(tmp_path / "ppo" / f"{EASY}_{k}" / "monitor.csv", skip=1)
         returns.append([(row["r"], row["is_success"]) for row in rows])
     assert len(returns[0]) == 2 and returns[0] == returns[1]
 
