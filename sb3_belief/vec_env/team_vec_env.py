@@ -340,7 +340,6 @@ class TeamVecEnv(VecEnv):
         return self.get_state()
 
     def _set_copies_state(self, state: Any) -> None:
-        """Restore what ``_copies_state`` returned."""
         self.set_state(state)  # type: ignore[attr-defined]
 
     # Checks
