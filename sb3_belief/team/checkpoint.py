@@ -106,27 +106,31 @@ class SavedTeam:
             check_parameters(content, f"{self.where}, agent {agent!r}")
         return {agent: io.BytesIO(content) for agent, content in self.models.items()}
 
-    @property
-    def parts(self) -> dict[str, PlainData]:
-        """What else was saved, by name. It is for ``decode``, which is to be told what it may name."""
-        return {name: self._part(name) for name in self.contents}
+    def plain_part(self, name: str) -> PlainData:
+        """
+        Return something else that was saved with the team, for ``decode``, which is to be told what it may name.
 
-    def _part(self, name: str) -> PlainData:
+        :param name: Name of the part, one of ``contents``
+        :return: The part
+        :raises ValueError: If it is damaged
+        """
         text, blob = self.contents[name]
-        return PlainData(from_json(text, f"{self.where}, member {f'parts/{name}.json'!r}", self.size), blob)
+        return PlainData(from_json(text, self._member(name), self.size), blob)
 
-    def part(self, name: str, allowed: Callable[[str], bool]) -> Any | None:
+    def part(self, name: str, allowed: Callable[[str], bool], accepts: Callable[[Any], bool] = lambda found: True) -> Any:
         """
         Return something else that was saved with the team.
 
-        :param name: Name of the part
+        :param name: Name of the part, one of ``contents``
         :param allowed: Whether classes and functions of a module may be named in it
-        :return: What ``decode`` makes of it, or None if there is none of that name
+        :param accepts: Whether a class or function that has been found may be used
+        :return: What ``decode`` makes of it
         :raises ValueError: If it is damaged, or names what is not allowed
         """
-        if name not in self.contents:
-            return None
-        return decode(self._part(name), allowed, f"{self.where}, member {f'parts/{name}.json'!r}")
+        return decode(self.plain_part(name), allowed, self._member(name), accepts)
+
+    def _member(self, name: str) -> str:
+        return f"{self.where}, member {f'parts/{name}.json'!r}"
 
     @property
     def scripted(self) -> dict[str, str]:

@@ -363,7 +363,7 @@ class Team(SB3Protocol):
         team._setup(loop, agents, saved.scripted, seed, manifest["normalize"], verbose, log_dir, tensorboard_log, jobs, on_nan)
         team.num_timesteps = manifest["num_timesteps"]
         if exact:
-            team._exact.load(saved.parts, loop)
+            team._exact.load(saved, loop)
         elif env is not None and seed is not None:
             env.seed(env_seed(seed))
         return team

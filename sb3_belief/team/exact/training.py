@@ -15,10 +15,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief.common.file_names import file_name
-from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
+from sb3_belief.common.plain_data import NotPlainError, PlainData, encode
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.common.safe_files.trust import UNTRUSTED
 from sb3_belief.team.agent_models import AgentModels, env_seed
+from sb3_belief.team.checkpoint import SavedTeam
 from sb3_belief.team.exact.agent_state import read_agent_state, write_agent_state
 from sb3_belief.team.exact.counted import callback_states, have_classes, restore_callbacks, restore_wrappers, wrapper_states
 from sb3_belief.team.lockstep.joint_loop import JointLoop
@@ -157,23 +158,23 @@ class ExactTraining:
 
     # Going on
 
-    def load(self, parts: Mapping[str, PlainData], loop: JointLoop | None) -> None:
+    def load(self, saved: SavedTeam, loop: JointLoop | None) -> None:
         """
         Keep a state until the team begins to learn.
 
-        :param parts: The parts of a team's file
+        :param saved: The contents of a team's file
         :param loop: The team's loop
         :raises ValueError: If there is no exact state among them, or one of another number of copies, or no environment
         """
         assert loop is not None
         names = {agent: _part(agent) for agent in self._team.possible_agents}
-        missing = [name for name in (_TEAM, *names.values()) if name not in parts]
+        missing = [name for name in (_TEAM, *names.values()) if name not in saved.contents]
         if missing:
             raise ValueError(
                 "This file does not hold the exact state of a training: it was saved without exact=True. Load it without, and"
                 " the training goes on with new episodes and other random numbers."
             )
-        state = decode(parts[_TEAM], UNTRUSTED.allowed, "the exact state of the team", UNTRUSTED.accepts)
+        state = saved.part(_TEAM, UNTRUSTED.allowed, UNTRUSTED.accepts)
         if not (isinstance(state, dict) and state.keys() == _ENTRIES and state["counters"].keys() == set(_COUNTERS)):
             raise ValueError("The exact state of the team is damaged, or of another version of this package.")
         if state["n_envs"] != loop.num_envs:
@@ -181,7 +182,7 @@ class ExactTraining:
                 f"The exact state is of {state['n_envs']} copies of the environment, which now has {loop.num_envs}: give as"
                 " many."
             )
-        self._pending, self._pending_agents = state, {agent: parts[name] for agent, name in names.items()}
+        self._pending, self._pending_agents = state, {agent: saved.plain_part(name) for agent, name in names.items()}
         for name, value in state["counters"].items():
             setattr(self._team, name, value)
 
@@ -194,11 +195,6 @@ class ExactTraining:
     def monitor_state(self) -> dict[str, Any] | None:
         """How far the monitor files were, until the team begins to learn; None without a state."""
         return None if self._pending is None else self._pending["monitor"]
-
-    @property
-    def is_pending(self) -> bool:
-        """Whether a state waits to be put back."""
-        return self._pending is not None
 
     def check_learn(self, reset_num_timesteps: bool) -> None:
         """
