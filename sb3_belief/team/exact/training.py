@@ -7,7 +7,7 @@ from there runs up to the same place, where everything is put back, over whateve
 
 import warnings
 from collections.abc import Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -229,11 +229,20 @@ class ExactTraining:
             loop.team_env.set_exact_state(state["env"])
         restore_wrappers(loop.env, state["wrappers"])
         loop.continue_from(*state["last"])
-        with rngs.put_aside():
+        if state["in_rollout"]:
+            # The rest of the agents' states is put back where the rollout begins. Without observations SB3 would reset
+            for agent, model in self._models.items():
+                model._last_obs = state["last"][0][agent]
+        else:
+            self._write(state, rngs.put_aside())
+        return True
+
+    def _write(self, state: dict[str, Any], rngs_put_aside: AbstractContextManager[None]) -> None:
+        """Put back what the agents go on from, and all random numbers."""
+        with rngs_put_aside:
             for agent, model in self._models.items():
                 write_agent_state(model, self._rngs[agent], self._pending_agents[agent])
             self._rng.set(state["rng"])
-        return True
 
     def at_first_rollout(self, loop: JointLoop, log: TeamLog) -> None:
         """
@@ -243,9 +252,12 @@ class ExactTraining:
         :param log: The team's log
         """
         state, agents = self._pending, self._pending_agents
-        self._pending, self._pending_agents = None, {}
         if state is None:
             return
+        if state["in_rollout"]:
+            self._write(state, loop.put_rngs_aside())
+            loop.restore_groups(agents)
+        self._pending, self._pending_agents = None, {}
         if state["log"] is not None:
             log.put_back(state["log"])
         if not state["in_rollout"]:
@@ -253,11 +265,6 @@ class ExactTraining:
             if state["callbacks"] is not None and have_classes(self._callback, state["callbacks"]):
                 restore_callbacks(self._callback, state["callbacks"], "the team")
             return
-        with loop.put_rngs_aside():
-            for agent, model in self._models.items():
-                write_agent_state(model, self._rngs[agent], agents[agent])
-            self._rng.set(state["rng"])
-        loop.restore_groups(agents)
         restore_callbacks(self._callback, state["callbacks"], "the team")
         for agent, callback in loop.callbacks.items():
             restore_callbacks(callback, state["agent_callbacks"].get(agent, []), repr(agent))
