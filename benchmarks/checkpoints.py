@@ -18,7 +18,7 @@ from sb3_belief.team import Checkpoints
 
 _KEY, _SECONDS = "checkpoints_vs_none", "seconds_of_a_checkpoint"
 # Some twenty seconds in each call
-_ROLLOUTS = 6
+_ROLLOUTS = 20
 #: Seconds between files, as ``train.py`` has them if nothing is said
 SAVE_EVERY = 600.0
 
