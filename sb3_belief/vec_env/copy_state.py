@@ -15,6 +15,7 @@ from typing import Any
 from gymnasium import spaces
 
 from sb3_belief.common.plain_data import PlainData, decode, encode
+from sb3_belief.common.plain_data.kinds import ATOMS
 
 # What is the same in every environment that is made by the same arguments
 _CONSTANTS = (types.FunctionType, types.BuiltinFunctionType, functools.partial, types.ModuleType, type, logging.Logger)
@@ -26,14 +27,15 @@ _DEEPEST = 100
 
 def _parts(value: Any) -> Iterator[tuple[str, Any]]:
     """Iterate over what an object holds, by the text that leads to it."""
+    # Not numbers and texts, which hold nothing, and of which there may be a million in a list
     if isinstance(value, dict):
-        yield from ((f"[{key!r}]", part) for key, part in value.items())
+        yield from ((f"[{key!r}]", part) for key, part in value.items() if type(part) not in ATOMS)
     elif isinstance(value, (list, tuple)):
-        yield from ((f"[{i}]", part) for i, part in enumerate(value))
+        yield from ((f"[{i}]", part) for i, part in enumerate(value) if type(part) not in ATOMS)
     elif isinstance(value, types.MethodType):
         yield ".__self__", value.__self__
     elif hasattr(value, "__dict__") and not isinstance(value, (*_CONSTANTS, spaces.Space)):
-        yield from ((f".{name}", part) for name, part in vars(value).items())
+        yield from ((f".{name}", part) for name, part in vars(value).items() if type(part) not in ATOMS)
 
 
 def _objects_of(root: Any) -> dict[str, Any]:
