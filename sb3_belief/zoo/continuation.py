@@ -136,7 +136,7 @@ def _go_on(
     env, eval_env = make_envs(config, options, stack)
     for each in (folder, folder / CHECKPOINTS, *folder.glob("agents/*")):
         sweep_temporary_files(each)
-    team, checkpoint = _load_newest(config, options, env, folder)
+    team, checkpoint = _load_newest(config, options, env, folder, signals)
     _say_what_differs(before)
     # Before the first step puts it back
     monitor = team.monitor_state
@@ -161,7 +161,9 @@ def _go_on(
         return learn_and_save(team, config, options, folder, record, callbacks, signals, False)
 
 
-def _load_newest(config: RunConfig, options: TrainOptions, env: TeamVecEnv, folder: Path) -> tuple[Team, Path]:
+def _load_newest(
+    config: RunConfig, options: TrainOptions, env: TeamVecEnv, folder: Path, signals: EndSignals
+) -> tuple[Team, Path]:
     """Return the team of the newest checkpoint that can be loaded, and its file."""
     why = ""
     for path in whole_checkpoints(folder):
@@ -170,6 +172,7 @@ def _load_newest(config: RunConfig, options: TrainOptions, env: TeamVecEnv, fold
             return Team.load(path, env=env, exact=True, **trust, **common_arguments(config, options, folder)), path
         # A damaged file makes zipfile, json and torch raise whatever they raise
         except Exception as error:
+            signals.check()
             why = f" {cause(error)}"
             print(f"{path} cannot be loaded ({cause(error)}): an earlier checkpoint is looked for.", file=sys.stderr)
     raise ConfigError(

@@ -8,7 +8,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -49,6 +49,9 @@ class EndSignals:
 
     A third signal ends the program at once. Only the main thread can handle signals: elsewhere nothing changes. A signal that
     is ignored when the context begins, as ``nohup`` has it, stays ignored.
+
+    What the handler raises may arrive as another error: before Python 3.12, as a RuntimeError if it comes while a class is
+    made, and PyTorch imports many of them when the first optimizer is made. An error after a signal thus counts as the signal.
     """
 
     def __init__(self) -> None:
@@ -65,11 +68,15 @@ class EndSignals:
                     self._before[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         for number, handler in self._before.items():
             # What was not set from Python is None
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         self._before = {}
+        if error is not None and self._raises and (ended_by := self.cause_of(error)) is not error:
+            raise ended_by from error
 
     def _handle(self, signum: int, _: FrameType | None) -> None:
         self._count += 1
@@ -89,6 +96,14 @@ class EndSignals:
         """
         if self._first is not None and self._raises:
             raise Interrupted(self._first)
+
+    def cause_of(self, error: BaseException) -> BaseException:
+        """
+        Return what has ended a training: the signal, if there has been one before the error, or else the error.
+
+        :param error: What was raised
+        """
+        return error if self._first is None or isinstance(error, Interrupted) else Interrupted(self._first)
 
     def hold(self) -> None:
         """Raise nothing from now on: the program is saving, and ends then."""

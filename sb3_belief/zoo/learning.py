@@ -127,7 +127,7 @@ def learn_and_save(
         signals.hold()
     except BaseException as caught:
         signals.hold()
-        error = caught
+        error = signals.cause_of(caught)
     end = _End(team, folder, callbacks.checkpoints, record)
     env = team.get_env()
     assert env is not None

@@ -289,6 +289,51 @@ def test_while_saving_signals_wait(capfd):
     assert capfd.readouterr().err == "Saving. A further signal ends the program at once, without.\n"
 
 
+def hit_as_another_error(*_, **__):
+    """Be hit by SIGTERM where a class is made: until Python 3.12, what the handler raises arrives as a RuntimeError."""
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except Interrupted as error:
+        raise RuntimeError("Error calling __set_name__ on 'cached_property' instance") from error
+
+
+def test_an_error_after_a_signal_is_the_signal():
+    with pytest.raises(Interrupted) as caught, EndSignals():
+        hit_as_another_error()
+    assert caught.value.exit_status == 143 and isinstance(caught.value.__cause__, RuntimeError)
+    # What is raised after the save is not the signal that came meanwhile
+    with pytest.raises(ValueError, match="the training failed"), EndSignals() as signals:
+        signals.hold()
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise ValueError("the training failed")
+
+
+def test_a_signal_that_arrives_as_another_error_in_a_training(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(SignalCheck, "_on_step", lambda self: self.num_timesteps < 200 or hit_as_another_error())
+    status, run = train(tmp_path)
+    assert status == 143 and not (run / "error.txt").exists()
+    assert (record_of(run)["status"], record_of(run)["signal"]) == ("interrupted", "SIGTERM")
+    assert "Interrupted by SIGTERM" in capsys.readouterr().out
+
+
+def test_a_signal_that_arrives_as_another_error_before_a_training(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sb3_belief.zoo.train.make_team", hit_as_another_error)
+    assert train_main([*WORDS, "-f", str(tmp_path), "-params", *SETTINGS]) == 143
+    assert capsys.readouterr().err == "Interrupted.\n" and not list(tmp_path.rglob("*_1"))
+
+
+def test_a_signal_while_a_checkpoint_is_loaded_does_not_make_it_a_damaged_one(tmp_path, undisturbed, monkeypatch, capsys):
+    result, run = interrupt(tmp_path, "rollout", "SIGTERM")
+    assert result.returncode == 143
+    before = (run / "run.json").read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(Team, "load", hit_as_another_error)
+        assert train_main(["--resume", str(run)]) == 143
+    assert capsys.readouterr().err == "Interrupted.\n" and (run / "run.json").read_bytes() == before
+    assert train_main(["--resume", str(run)]) == 0
+    check_same_run(run, undisturbed)
+
+
 # Pieces
 
 
