@@ -5,6 +5,7 @@ import os
 import random
 import re
 import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -75,8 +76,10 @@ def test_growth_counts_from_a_moment_on():
     # Grows fast, then by a tenth within the hour
     samples = [(60.0 * minute, 100.0 + 10 * min(minute, 10) + 0.4 * max(minute - 10, 0)) for minute in range(61)]
     first, last, grown = growth(samples, after=600.0)
-    assert first == pytest.approx(201.2) and last == pytest.approx(218.8)
+    # Medians of minutes 10 to 14 and 56 to 60
+    assert first == pytest.approx(200.8) and last == pytest.approx(219.2)
     assert grown == pytest.approx(last / first - 1)
+    assert growth(samples, after=3600.0) is None and growth([], after=0.0) is None
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -108,10 +111,19 @@ def test_the_environment_obeys_once(tmp_path):
     assert (env.steps, quiet.steps) == (2, 1)
 
 
+def test_a_folder_whose_path_is_too_long_for_sockets_is_refused(tmp_path):
+    folder = tmp_path / ("x" * 80)
+    with pytest.raises(ValueError, match="take a shorter folder"):
+        soak(0.1, 0, folder)
+    assert not folder.exists()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="looks for processes in /proc")
-def test_a_short_soak_finds_nothing(tmp_path):
-    report = soak(1.5, 5, tmp_path)
+def test_a_short_soak_finds_nothing():
+    # Not pytest's own, whose path is too long
+    with tempfile.TemporaryDirectory(prefix="soak-") as folder:
+        report = soak(1.5, 5, Path(folder))
     assert not report.violations
     assert report.runs > 0 and sum(report.faults.values()) > 0 and report.checks["the team loads"] > 0
 

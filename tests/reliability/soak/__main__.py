@@ -9,6 +9,7 @@ The exit status is 1 if an invariant did not hold.
 
 import argparse
 import contextlib
+import os
 import random
 import shutil
 import subprocess
@@ -25,6 +26,8 @@ from tests.reliability.soak.report import Report
 from tests.reliability.soak.runs import Soak
 
 _DISK_SIZE = "24m"
+# A socket's path has at most 107 bytes (unix(7)), of which multiprocessing's names take 34
+_LONGEST_PATH = 70
 
 
 @contextlib.contextmanager
@@ -50,10 +53,15 @@ def soak(minutes: float, seed: int, folder: Path) -> Report:
     :param seed: Seed of everything that is drawn
     :param folder: A new folder for all that is written
     :return: What was found
+    :raises ValueError: If its path is too long for the sockets of processes that fork workers
     """
     report = Report(seed)
     start = time.monotonic()
     temporary = folder / "tmp"
+    if len(os.fsencode(temporary.absolute())) > _LONGEST_PATH:
+        raise ValueError(
+            f"{temporary.absolute()} has more than {_LONGEST_PATH} bytes, too many for a socket in it: take a shorter folder."
+        )
     for path in (folder / "outputs", temporary):
         path.mkdir()
     launcher = Launcher(folder / "outputs", "tests.reliability.ordered_env", temporary=temporary)
