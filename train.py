@@ -2,7 +2,7 @@
 
 import sys
 
-from sb3_belief.zoo.cli import train_main
+from sb3_belief.cli.main import train_main
 
 if __name__ == "__main__":
     sys.exit(train_main())

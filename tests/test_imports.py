@@ -15,6 +15,7 @@ LAYERS = [
     {"team"},
     {"report", "export"},
     {"zoo"},
+    {"cli"},
 ]
 LEVEL = {package: level for level, packages in enumerate(LAYERS) for package in packages}
 
@@ -98,7 +99,7 @@ def test_no_circle_of_files():
     ("module", "line"),
     [
         ("sb3_belief.envs.registry", "from sb3_belief.team import Team"),
-        ("sb3_belief.envs.registry", "def f():\n    import sb3_belief.zoo.cli"),
+        ("sb3_belief.envs.registry", "def f():\n    import sb3_belief.cli.main"),
         ("sb3_belief.vec_env.joint_env", "from sb3_belief.belief_ppo import others"),
         ("sb3_belief.belief.network", "from sb3_belief import Team"),
     ],

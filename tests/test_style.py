@@ -12,8 +12,8 @@ PACKAGE = sorted((ROOT / "sb3_belief").rglob("*.py"))
 ALL = sorted(
     path for folder in ("sb3_belief", "benchmarks", "studies", "examples", "tests") for path in (ROOT / folder).rglob("*.py")
 )
-# Every adapter has these two, by which the registry names them
-ENTRY_POINTS = {"make", "names"}
+# Every adapter has the first two, by which the registry names them, and every command the others
+ENTRY_POINTS = {"make", "names", "add_flags", "run"}
 
 
 def name(path: Path) -> str:

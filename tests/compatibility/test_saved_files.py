@@ -14,7 +14,7 @@ import pytest
 import torch as th
 
 from sb3_belief import MaskableBeliefPPO, Team, make_team_env
-from sb3_belief.zoo.cli import main as command
+from sb3_belief.cli.main import main as command
 from tests.compatibility.write_files import ENV_ID, RUN_ENV_ID, outputs
 
 DATA = Path(__file__).parent / "data"

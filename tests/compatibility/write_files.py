@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO, Team, make_team_env
-from sb3_belief.zoo.cli import main as command
+from sb3_belief.cli.main import main as command
 
 ENV_ID, RUN_ENV_ID = "traffic-junction-easy", "convention-redraw"
 SMALL: dict[str, Any] = {

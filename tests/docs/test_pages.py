@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_belief.zoo.cli import make_parser
+from sb3_belief.cli.main import make_parser
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.names import get_env
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sb3_belief.zoo.cli import make_parser
+from sb3_belief.cli.main import make_parser
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")

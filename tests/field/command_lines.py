@@ -13,7 +13,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
-from sb3_belief.zoo.cli import main
+from sb3_belief.cli.main import main
 from sb3_belief.zoo.names import ALGOS
 from sb3_belief.zoo.settings import RUN_KEYS
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import yaml
 
+from sb3_belief.cli.main import COMMANDS, main, train_main
 from sb3_belief.common.versions import __version__
 from sb3_belief.envs import registry
 from sb3_belief.team import Team
 from sb3_belief.zoo import preflight
-from sb3_belief.zoo.cli import COMMANDS, main, train_main
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError, cause, shorten
 from tests.field.command_lines import SMALL, TINY, refused
 
 JUNCTION = "traffic-junction-easy"
-_RUN = "import sys; from sb3_belief.zoo.cli import main; sys.exit(main({words}))"
+_RUN = "import sys; from sb3_belief.cli.main import main; sys.exit(main({words}))"
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_a_closed_pipe_of_another_program_is_no_end_of_the_output(monkeypatch):
     def fail(*_):
         raise BrokenPipeError("of a worker")
 
-    monkeypatch.setitem(COMMANDS, "envs", (*COMMANDS["envs"][:2], fail))
+    monkeypatch.setattr(COMMANDS["envs"], "run", fail)
     with pytest.raises(BrokenPipeError, match="of a worker"):
         main(["envs"])
 
@@ -355,7 +355,7 @@ def test_registered_ids_and_open_constructors(tmp_path, monkeypatch, capsys):
 
 def test_help_needs_no_torch():
     program = (
-        "import sys\nfrom sb3_belief.zoo.cli import main\n"
+        "import sys\nfrom sb3_belief.cli.main import main\n"
         "for words in ('--help', 'train --help', 'demo --help', '--version', 'train -n inf', 'train --seed 1 2'):\n"
         "    try:\n        main(words.split())\n    except SystemExit:\n        pass\n"
         "print([name for name in ('torch', 'stable_baselines3', 'pettingzoo', 'numpy') if name in sys.modules])\n"

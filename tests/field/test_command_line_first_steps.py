@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sb3_belief.zoo.cli import main
+from sb3_belief.cli.main import main
 from tests.field.command_lines import SMALL, TINY, refused
 
 JUNCTION = "traffic-junction-easy"

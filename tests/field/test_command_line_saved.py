@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 
-from sb3_belief.zoo.cli import main
+from sb3_belief.cli.main import main
 from tests.archives import Evil, changed, evil_data, rewrite
 from tests.field.command_lines import CODE, ENV, MADE, SMALL, TINY, check, draws
 from tests.field.walkers import Walkers

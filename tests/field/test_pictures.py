@@ -7,9 +7,9 @@ import pytest
 from gymnasium import spaces
 
 from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.cli.main import main
 from sb3_belief.envs import make_parallel_env
 from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
-from sb3_belief.zoo.cli import main
 from tests.field.command_lines import ENV
 from tests.team.toy_envs import ToyEnv
 

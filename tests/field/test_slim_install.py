@@ -125,7 +125,7 @@ def test_packages_are_reached_as_attributes():
 
 def test_a_command_says_what_an_install_for_serving_lacks():
     script = (
-        "import sys; sys.modules['sb3_contrib'] = None; from sb3_belief.zoo.cli import main; sys.exit(main(['export', 'x']))"
+        "import sys; sys.modules['sb3_contrib'] = None; from sb3_belief.cli.main import main; sys.exit(main(['export', 'x']))"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert ended.returncode == 2 and ended.stderr.startswith("Refused: this command needs sb3_contrib, which"), ended.stderr

@@ -13,9 +13,9 @@ import pytest
 import torch as th
 
 from sb3_belief import BeliefPPO, Team
+from sb3_belief.cli.main import main
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team.fixed_partners.partners import load_model
-from sb3_belief.zoo.cli import main
 from tests.archives import Evil, archive_of, changed, changed_json, evil_data, members_of
 from tests.field.command_lines import ENV, SMALL, TINY
 
@@ -178,7 +178,7 @@ NAMES += [
     "stable_baselines3.common.monitor:Monitor",
     "stable_baselines3.common.save_util:th.load",
     "torch.nn.modules.module:torch.load",
-    "sb3_belief.zoo.cli:main",
+    "sb3_belief.cli.main:main",
 ]
 
 
@@ -225,7 +225,7 @@ def test_what_a_stranger_writes_beside_the_team_runs_nothing(run, tmp_path, monk
     folder = tmp_path / "run"
     Path("evil.pkl").write_bytes(evil_pickle(b""))
     envs = ["stable_baselines3.common.save_util:load_from_pkl", "os:system", "lbf/canary:Env-v0", "torch.nn:Linear"]
-    envs += ["sb3_belief.zoo.cli:main", "stable_baselines3.common.monitor:Monitor"]
+    envs += ["sb3_belief.cli.main:main", "stable_baselines3.common.monitor:Monitor"]
     outside = {
         "callback": {"stable_baselines3.common.callbacks.CheckpointCallback": {"save_freq": 1, "save_path": "../elsewhere"}},
         "env_wrapper": {"stable_baselines3.common.monitor.Monitor": {"filename": "elsewhere"}},

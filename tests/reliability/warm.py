@@ -24,7 +24,7 @@ def _import_all() -> None:
     import torch as th
 
     import sb3_belief.belief_ppo
-    import sb3_belief.zoo.cli
+    import sb3_belief.cli.main
     import sb3_belief.zoo.continuation
     import sb3_belief.zoo.train  # noqa: F401
 
@@ -44,7 +44,7 @@ def _become(words: list[str], output: str, limit: int | None) -> int:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     # The server runs, but is no child of this process, which the original asks for
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]
-    from sb3_belief.zoo.cli import main
+    from sb3_belief.cli.main import main
 
     try:
         return main(words)

@@ -11,8 +11,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_belief import BeliefPPO
+from sb3_belief.cli.main import train_main
 from sb3_belief.team import NonFiniteError
-from sb3_belief.zoo.cli import train_main
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import ToyEnv
 

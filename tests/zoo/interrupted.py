@@ -13,7 +13,7 @@ import time
 from stable_baselines3 import PPO
 
 import sb3_belief.common.durable_files as durable_files
-from sb3_belief.zoo.cli import train_main
+from sb3_belief.cli.main import train_main
 from sb3_belief.zoo.endings import SignalCheck
 from sb3_belief.zoo.seeded_evaluation import SeededEvalCallback
 

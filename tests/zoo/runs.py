@@ -6,8 +6,8 @@ import json
 import numpy as np
 import torch as th
 
+from sb3_belief.cli.main import train_main
 from sb3_belief.team import Team
-from sb3_belief.zoo.cli import train_main
 
 EASY = "traffic-junction-easy"
 SETTINGS = ["n_envs:4", "n_steps:20", "batch_size:40", "n_epochs:1"]

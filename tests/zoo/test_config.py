@@ -7,10 +7,10 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn, optim
 
+from sb3_belief.cli.main import main, train_main
 from sb3_belief.envs.registry import registered_ids
 from sb3_belief.envs.suites import SUITES
 from sb3_belief.zoo import config as config_module
-from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.config import REPO_CONFIGS, load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.names import ALGOS

@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
+from sb3_belief.cli.main import main
 from sb3_belief.team import make_team_env
-from sb3_belief.zoo.cli import main
 from sb3_belief.zoo.demo import ENV_ID
 from sb3_belief.zoo.evaluate import Outcome, evaluate
 

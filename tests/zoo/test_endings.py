@@ -15,8 +15,8 @@ import pytest
 
 import sb3_belief
 import sb3_belief.common.durable_files as durable_files
+from sb3_belief.cli.main import train_main
 from sb3_belief.team import Team
-from sb3_belief.zoo.cli import train_main
 from sb3_belief.zoo.endings import EndSignals, Interrupted, SignalCheck, save_somewhere, write_traceback
 from sb3_belief.zoo.errors import RunFailed
 from tests.zoo import interrupted

@@ -5,11 +5,11 @@ import sys
 import pytest
 import yaml
 
+from sb3_belief.cli.main import main, train_main
 from sb3_belief.envs import suites
 from sb3_belief.envs.suites import SUITES
 from sb3_belief.team import Team
 from sb3_belief.zoo import envs
-from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.run_folder import run_of

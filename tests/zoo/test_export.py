@@ -8,7 +8,7 @@ import pytest
 import torch as th
 
 from sb3_belief import BeliefPPO, Team, make_team_env
-from sb3_belief.zoo.cli import main
+from sb3_belief.cli.main import main
 from tests.archives import archive_of, changed, changed_json, evil_data, members_of, rewrite
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_belief.cli.main import train_main
 from sb3_belief.team import Team
-from sb3_belief.zoo.cli import train_main
 from sb3_belief.zoo.run_folder import CHECKPOINTS
 from tests.zoo.runs import SETTINGS, record_of, table, train
 

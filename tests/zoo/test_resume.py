@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 import sb3_belief
+from sb3_belief.cli.main import main, train_main
 from sb3_belief.team import Team, TeamVecEnv
-from sb3_belief.zoo.cli import main, train_main
 from sb3_belief.zoo.endings import Interrupted, SignalCheck
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.resume import resume_config

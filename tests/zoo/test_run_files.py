@@ -35,7 +35,7 @@ def test_environments_that_a_file_may_name(env_id):
         "stable_baselines3.common.save_util:load_from_pkl",
         "stable_baselines3.common.monitor:Monitor",
         "sb3_belief.envs.registry:make_parallel_env",
-        "sb3_belief.zoo.cli:main",
+        "sb3_belief.cli.main:main",
         "torch.nn:Linear",
     ],
 )

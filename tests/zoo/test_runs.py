@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
+from sb3_belief.cli.main import main, train_main
 from sb3_belief.envs import TrafficJunction
 from sb3_belief.envs.traffic_junction.vec_env import TrafficJunctionVecEnv
 from sb3_belief.team import Team, make_team_env
-from sb3_belief.zoo.cli import main, train_main
 from tests.zoo.runs import table
 
 EASY = "traffic-junction-easy"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_belief.zoo.cli import train_main
+from sb3_belief.cli.main import train_main
 from tests.vec_env.test_worker_faults import LINUX, gone_within, marked, no_test_hangs  # noqa: F401 (a fixture)
 
 TROUBLED = "tests.vec_env.faulty_envs:Troubled"
