@@ -143,7 +143,7 @@ def write_traceback(folder: Path, error: BaseException) -> Path | None:
 
 def save_somewhere(path: Path, write: Callable[[Path], object]) -> Path | None:
     """
-    Write a file to its place, or else to another one, which is said.
+    Write a file to its place, or else to another one, which is said. There it takes no other file's place.
 
     :param path: The file, in the folder of a run
     :param write: Writes it to a path
@@ -153,14 +153,33 @@ def save_somewhere(path: Path, write: Callable[[Path], object]) -> Path | None:
     elsewhere = f"{run.parent.name}_{run.name}_{path.name}"
     for place in (path, run.parent / elsewhere, Path(tempfile.gettempdir()) / elsewhere):
         try:
-            write(place)
+            if place == path:
+                write(place)
+                return place
+            return _write_elsewhere(place, write)
         except OSError as error:
             tell(f"{place} could not be written ({reason_of(error)}).")
-            continue
-        if place != path:
-            tell(f"The team has been saved as {place} instead.")
-        return place
     return None
+
+
+def _write_elsewhere(wanted: Path, write: Callable[[Path], object]) -> Path:
+    """Write a file to a place where none is, since runs in several folders for logs have the same names."""
+    place, number = wanted, 1
+    while True:
+        try:
+            # Nobody else takes the name meanwhile
+            place.touch(exist_ok=False)
+            break
+        except FileExistsError:
+            number += 1
+            place = wanted.with_stem(f"{wanted.stem}_{number}")
+    try:
+        write(place)
+    except BaseException:
+        place.unlink(missing_ok=True)
+        raise
+    tell(f"The team has been saved as {place} instead.")
+    return place
 
 
 def tell(text: str) -> None:

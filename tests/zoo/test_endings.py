@@ -349,6 +349,27 @@ def test_a_file_for_which_there_is_no_place(tmp_path, capfd):
     assert capfd.readouterr().err.count("could not be written (full)") == 3
 
 
+def test_what_is_saved_elsewhere_takes_no_other_files_place(tmp_path, monkeypatch, capfd):
+    """Two runs of one name on two full disks have the same place elsewhere."""
+    elsewhere = tmp_path / "tmp"
+    elsewhere.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
+    for folder, names in (("one", ["ppo_game_1_team.zip"]), ("two", ["ppo_game_1_team.zip", "ppo_game_1_team_2.zip"])):
+
+        def write(place, content=folder):
+            if place.parent != elsewhere:
+                raise OSError(errno.ENOSPC, "full")
+            place.write_text(content)
+
+        saved = save_somewhere(tmp_path / folder / "ppo" / "game_1" / "team.zip", write)
+        assert saved == elsewhere / names[-1] and saved.read_text() == folder
+        assert sorted(path.name for path in elsewhere.iterdir()) == names
+        assert f"saved as {saved} instead" in capfd.readouterr().err
+    # Nothing is left where it could not be written
+    assert save_somewhere(tmp_path / "ppo" / "game_1" / "team.zip", fail_with(OSError(errno.ENOSPC, "full"))) is None
+    assert len(list(elsewhere.iterdir())) == 2 and not list(tmp_path.glob("ppo/*"))
+
+
 def test_the_moments_of_the_driver_are_those_of_the_tests():
     assert set(REACHED) | {"end"} == set(interrupted.MOMENTS)
 
