@@ -266,7 +266,7 @@ def _check_studies(table: pa.Table) -> None:
     for (environment, arm), names in studies.items():
         if len(names) > 1:
             raise ValueError(
-                f"Studies {_listed(names)} all hold {arm!r} on {environment!r}: keep the rows of one of them, or rename an arm."
+                f"Studies {_listed(names)} all hold {arm!r} on {environment!r}: keep one of them, or rename an arm."
             )
 
 
