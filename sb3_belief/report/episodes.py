@@ -88,6 +88,23 @@ def write_episodes_table(table: pa.Table, path: str | os.PathLike[str]) -> Path:
     return target
 
 
+def episodes_of(table: pa.Table, checkpoint: str, deterministic: bool) -> pa.Table:
+    """
+    Return the episodes of one kind of evaluation.
+
+    :param table: The episodes
+    :param checkpoint: The weights that were evaluated: ``"best"``, ``"last"``, or ``"current"`` for those while training
+    :param deterministic: Whether the team acted greedily
+    :return: Their rows
+    :raises ValueError: For another checkpoint, or if two studies hold the same arm on the same environment
+    """
+    allowed = [name for names in CHECKPOINTS.values() for name in names]
+    if checkpoint not in allowed:
+        raise ValueError(f"checkpoint is {checkpoint!r}; it must be one of {', '.join(map(repr, allowed))}.")
+    _check_studies(table)
+    return table.filter((pc.field("checkpoint") == checkpoint) & (pc.field("deterministic") == deterministic))
+
+
 def scores(
     table: pa.Table, quantity: str = "return", checkpoint: str = "best", deterministic: bool = True
 ) -> dict[str, dict[str, dict[int, float]]]:
@@ -104,9 +121,6 @@ def scores(
     :raises ValueError: For another quantity or checkpoint, if two studies hold the same arm on the same environment, if a run
         has two final evaluations of one checkpoint or a score that is not finite, or if no environment reports successes
     """
-    allowed = [name for names in CHECKPOINTS.values() for name in names]
-    if checkpoint not in allowed:
-        raise ValueError(f"checkpoint is {checkpoint!r}; it must be one of {', '.join(map(repr, allowed))}.")
     found: dict[str, dict[str, dict[int, float]]] = {}
     for (environment, arm, seed), evaluations in _evaluations(table, quantity, checkpoint, deterministic).items():
         if checkpoint != "current" and len(evaluations) > 1:
@@ -232,8 +246,7 @@ def _evaluations(
     if quantity not in COLUMNS:
         raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, COLUMNS))}.")
     column = COLUMNS[quantity]
-    _check_studies(table)
-    chosen = table.filter((pc.field("checkpoint") == checkpoint) & (pc.field("deterministic") == deterministic))
+    chosen = episodes_of(table, checkpoint, deterministic)
     reported = _reported(chosen) if quantity == "success" else None
     groups = chosen.group_by(["environment", "arm", "seed", "joint_steps"], use_threads=False)
     found: dict[tuple[str, str, int], dict[int, float]] = defaultdict(dict)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from sb3_belief.report.resampling import LEVEL, RESAMPLES, bootstrap_interval, student
 from sb3_belief.report.statistics import (
@@ -99,6 +98,9 @@ def permutation_p_value(
     :return: The p-value. None if an environment has one seed only
     :raises ValueError: If there are not as many environments of one arm as of the other
     """
+    # Who lacks scipy has been told so by now
+    from scipy import stats
+
     _check_pairs(ours, theirs)
     if min(len(each) for each in (*ours, *theirs)) < 2:
         return None
