@@ -31,7 +31,12 @@ class Band(NamedTuple):
 
 
 def efficiency_curve(
-    steps: np.ndarray, values: np.ndarray, *, method: str = "corrected", n_resamples: int = RESAMPLES
+    steps: np.ndarray,
+    values: np.ndarray,
+    *,
+    method: str = "corrected",
+    n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> Band:
     """
     Return the interquartile mean over seeds at each evaluation of one arm in one environment.
@@ -41,10 +46,11 @@ def efficiency_curve(
         are left out for all, since a mean over other seeds would be of something else
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: The curve in the environment's own unit, empty if the seeds have no evaluation in common
     """
     common = np.isfinite(values).all(axis=0)
-    return _band(steps[common], [values[:, common].T], method, n_resamples)
+    return _band(steps[common], [values[:, common].T], method, n_resamples, limits)
 
 
 def overall_curves(
@@ -54,6 +60,7 @@ def overall_curves(
     n_points: int = 51,
     method: str = "corrected",
     n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> dict[str, Band]:
     """
     Return the interquartile mean over the seeds of all environments, over the share of the training that has passed.
@@ -67,6 +74,7 @@ def overall_curves(
     :param n_points: Number of positions between 0 and 1. Those before an environment's first evaluation are left out
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: {arm: curve of normalised values}, empty if no environment has all arms or an evaluation of all runs
     """
     arms = list(dict.fromkeys(arm for of_arms in curves.values() for arm in of_arms))
@@ -85,7 +93,11 @@ def overall_curves(
             first = max(first, at[0])
             strata[arm].append(np.array([np.interp(grid, at, row) for row in kept]).T)
     inside = grid >= first - 1e-12
-    return {arm: _band(grid[inside], [each[inside] for each in of], method, n_resamples) for arm, of in strata.items() if of}
+    return {
+        arm: _band(grid[inside], [each[inside] for each in of], method, n_resamples, limits)
+        for arm, of in strata.items()
+        if of
+    }
 
 
 def performance_profiles(
@@ -117,19 +129,26 @@ def performance_profiles(
     found = {}
     for arm, of_arm in strata.items():
         above = [(each > taus[:, None]).astype(np.float64) for each in of_arm]
-        values = _pooled_mean(*above, axis=-1)
-        interval = bootstrap_interval(above, _pooled_mean, method=method, n_resamples=n_resamples, bounds=(0.0, 1.0))
+        values = pooled_mean(*above, axis=-1)
+        interval = bootstrap_interval(above, pooled_mean, method=method, n_resamples=n_resamples, limits=(0.0, 1.0))
         low, high = interval or (None, None)
         found[arm] = Band(taus, values, low, high, min(map(len, of_arm)))
     return found
 
 
-def _pooled_mean(*strata: np.ndarray, axis: int) -> np.ndarray:
+def pooled_mean(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+    """
+    Return the mean of all values, those of all strata in one pool.
+
+    :param strata: Values of each stratum
+    :param axis: The axis to reduce over
+    :return: The mean
+    """
     return np.concatenate(strata, axis=axis).mean(axis=axis)
 
 
-def _band(x: np.ndarray, strata: list[np.ndarray], method: str, n_resamples: int) -> Band:
+def _band(x: np.ndarray, strata: list[np.ndarray], method: str, n_resamples: int, limits: tuple[float, float] | None) -> Band:
     """Return the band of strata ``[k, n]``."""
-    interval = bootstrap_interval(strata, interquartile_mean, method=method, n_resamples=n_resamples)
+    interval = bootstrap_interval(strata, interquartile_mean, method=method, n_resamples=n_resamples, limits=limits)
     low, high = interval or (None, None)
     return Band(x, interquartile_mean(*strata), low, high, min(each.shape[-1] for each in strata))

@@ -56,7 +56,7 @@ def bootstrap_interval(
     method: str = "corrected",
     level: float = LEVEL,
     n_resamples: int = RESAMPLES,
-    bounds: tuple[float, float] | None = None,
+    limits: tuple[float, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return a stratified bootstrap interval of a statistic.
@@ -67,7 +67,7 @@ def bootstrap_interval(
     :param method: ``"percentile"`` as in rliable, or ``"corrected"``: its sides stretched by ``widening``
     :param level: Share of repetitions in which the interval is to contain the truth
     :param n_resamples: Number of resamples
-    :param bounds: The lowest and the highest value that the statistic can take, if it has such; the interval ends there
+    :param limits: The lowest and the highest value that the statistic can take, if it has such; the interval ends there
     :return: Lower and upper ends, of the statistic's shape. None if a stratum has one seed only, which says nothing of spread
     :raises ValueError: For another method
     """
@@ -97,6 +97,6 @@ def bootstrap_interval(
         factor = widening(sizes, level)
         # A skewed distribution's percentiles may lie on one side of the value: that side is left as it is
         low, high = value - factor * np.maximum(value - low, 0), value + factor * np.maximum(high - value, 0)
-    if bounds is not None:
-        low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
+    if limits is not None:
+        low, high = np.maximum(low, limits[0]), np.minimum(high, limits[1])
     return low, high

@@ -95,6 +95,7 @@ def estimate(
     method: str = "corrected",
     level: float = LEVEL,
     n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> IntervalEstimate:
     """
     Return an aggregate of scores with its stratified bootstrap interval.
@@ -104,6 +105,7 @@ def estimate(
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param level: Share of repetitions in which the interval is to contain the truth
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: The estimate; without an interval if an environment has one seed only
     :raises ValueError: For another aggregate or method, or if there is no score
     """
@@ -114,7 +116,7 @@ def estimate(
         raise ValueError("There is no score to aggregate: each environment needs at least one seed.")
     statistic = AGGREGATES[aggregate]
     value = float(statistic(*values, axis=-1))
-    interval = bootstrap_interval(values, statistic, method=method, level=level, n_resamples=n_resamples)
+    interval = bootstrap_interval(values, statistic, method=method, level=level, n_resamples=n_resamples, limits=limits)
     return with_interval(value, interval, values)
 
 
@@ -225,7 +227,12 @@ def rescaled(value: Any, bounds: tuple[float, float]) -> Any:
 
 
 def estimates_by_environment(
-    scores: Scores, aggregate: str = "iqm", *, method: str = "corrected", n_resamples: int = RESAMPLES
+    scores: Scores,
+    aggregate: str = "iqm",
+    *,
+    method: str = "corrected",
+    n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> dict[str, dict[str, IntervalEstimate]]:
     """
     Return the aggregate over seeds of each arm in each environment, in the environment's own unit.
@@ -234,11 +241,12 @@ def estimates_by_environment(
     :param aggregate: A key of ``AGGREGATES``
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: {environment: {arm: estimate}}
     """
     return {
         environment: {
-            arm: estimate([np.array(list(seeds.values()))], aggregate, method=method, n_resamples=n_resamples)
+            arm: estimate([np.array(list(seeds.values()))], aggregate, method=method, n_resamples=n_resamples, limits=limits)
             for arm, seeds in arms.items()
             if seeds
         }
@@ -253,6 +261,7 @@ def overall_estimates(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     method: str = "corrected",
     n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> dict[str, IntervalEstimate]:
     """
     Return the aggregate of each arm over the seeds of all environments, of normalised scores.
@@ -262,9 +271,11 @@ def overall_estimates(
     :param bounds: Bounds of the normalisation, see ``normalized_scores``
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: {arm: estimate}, empty if no environment has all arms
     """
     of_all = normalized_scores(shared(scores), bounds)
     return {
-        arm: estimate(strata_of(of_all, arm), aggregate, method=method, n_resamples=n_resamples) for arm in arms_of(of_all)
+        arm: estimate(strata_of(of_all, arm), aggregate, method=method, n_resamples=n_resamples, limits=limits)
+        for arm in arms_of(of_all)
     }

@@ -64,13 +64,19 @@ def probability_of_improvement(
     """
     _check_pairs(ours, theirs)
     strata = [np.asarray(each, dtype=np.float64) for each in (*ours, *theirs)]
-    value = float(_improvement(*strata, axis=-1))
-    interval = bootstrap_interval(strata, _improvement, method=method, n_resamples=n_resamples, bounds=(0.0, 1.0))
+    value = float(share_of_wins(*strata, axis=-1))
+    interval = bootstrap_interval(strata, share_of_wins, method=method, n_resamples=n_resamples, limits=(0.0, 1.0))
     return with_interval(value, interval, strata)
 
 
-def _improvement(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
-    """P(X > Y) + P(X = Y) / 2 of the first half of the strata against the second, averaged over the pairs."""
+def share_of_wins(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
+    """
+    Return the share of pairs of runs in which the arm scores higher, ties counting half, the mean over environments.
+
+    :param strata: Scores of the arm in each environment, and then those of the other arm in the same environments
+    :param axis: The axis to reduce over
+    :return: The share, P(X > Y) + P(X = Y) / 2
+    """
     half = len(strata) // 2
     chances = []
     for x, y in zip(strata[:half], strata[half:], strict=True):
@@ -108,7 +114,7 @@ def permutation_p_value(
     tests = [
         stats.permutation_test(
             (np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)),
-            _improvement,
+            share_of_wins,
             permutation_type="independent",
             vectorized=True,
             n_resamples=n_resamples,
@@ -193,7 +199,12 @@ def seeds_needed(
 
 
 def compare_with_baseline(
-    scores: Scores, baseline: str, *, method: str = "corrected", n_resamples: int = RESAMPLES
+    scores: Scores,
+    baseline: str,
+    *,
+    method: str = "corrected",
+    n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> dict[str, list[BaselineComparison]]:
     """
     Compare each arm with the baseline in each environment that has both, in the environment's own unit.
@@ -202,6 +213,7 @@ def compare_with_baseline(
     :param baseline: Name of the arm that the others are compared with
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: {environment: its comparisons}; Holm's correction is over those of one environment
     :raises ValueError: If no environment has the baseline
     """
@@ -211,7 +223,7 @@ def compare_with_baseline(
         others = [arm for arm in arms if arm != baseline and arms[arm]]
         if arms.get(baseline):
             strata = {arm: strata_of({environment: arms}, arm) for arm in (baseline, *others)}
-            found[environment] = _compared(strata, baseline, method, n_resamples)
+            found[environment] = _compared(strata, baseline, method, n_resamples, limits)
     return found
 
 
@@ -222,6 +234,7 @@ def compare_overall(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     method: str = "corrected",
     n_resamples: int = RESAMPLES,
+    limits: tuple[float, float] | None = None,
 ) -> list[BaselineComparison]:
     """
     Compare each arm with the baseline over all environments in which all arms have runs, by normalised scores.
@@ -231,6 +244,7 @@ def compare_overall(
     :param bounds: Bounds of the normalisation, see ``statistics.normalized_scores``
     :param method: Kind of interval, see ``resampling.bootstrap_interval``
     :param n_resamples: Number of resamples
+    :param limits: Lowest and highest possible value, (0, 1) for success rates, if there are such; intervals end there
     :return: The comparisons, with Holm's correction over them; empty if no environment has all arms
     :raises ValueError: If no environment has the baseline
     """
@@ -238,19 +252,23 @@ def compare_overall(
     of_all = normalized_scores(shared(scores), bounds)
     if not of_all:
         return []
-    return _compared({arm: strata_of(of_all, arm) for arm in arms_of(of_all)}, baseline, method, n_resamples)
+    return _compared({arm: strata_of(of_all, arm) for arm in arms_of(of_all)}, baseline, method, n_resamples, limits)
 
 
 def _compared(
-    strata: Mapping[str, Sequence[np.ndarray]], baseline: str, method: str, n_resamples: int
+    strata: Mapping[str, Sequence[np.ndarray]],
+    baseline: str,
+    method: str,
+    n_resamples: int,
+    limits: tuple[float, float] | None,
 ) -> list[BaselineComparison]:
     theirs = strata[baseline]
-    reference = estimate(theirs, method=method, n_resamples=n_resamples)
+    reference = estimate(theirs, method=method, n_resamples=n_resamples, limits=limits)
     others = [arm for arm in strata if arm != baseline]
     p_values = [permutation_p_value(strata[arm], theirs, n_resamples) for arm in others]
     found = []
     for arm, p_value, corrected in zip(others, p_values, holm(p_values), strict=True):
-        own = estimate(strata[arm], method=method, n_resamples=n_resamples)
+        own = estimate(strata[arm], method=method, n_resamples=n_resamples, limits=limits)
         chance = probability_of_improvement(strata[arm], theirs, method=method, n_resamples=n_resamples)
         needed = seeds_needed(own, reference, len(theirs))
         found.append(BaselineComparison(arm, own, reference, chance, p_value, corrected, verdict(own, reference), needed))
