@@ -94,7 +94,7 @@ def permutation_p_value(
 
     It is a permutation test: the runs of an environment are dealt to the two arms anew. The statistic is the probability of
     improvement, so in one environment this is the test of Mann and Whitney, exact also where scores tie, as success rates
-    often do, and no unit of an environment outweighs another's. Up to about 8 seeds all deals are counted, beyond that and
+    often do, and no unit of an environment outweighs another's. Up to 7 seeds an arm all deals are counted, beyond that and
     over several environments deals are drawn. With 3 seeds an arm no p-value in one environment is below 0.1, with 4 below
     0.029, with 5 below 0.008.
 

@@ -14,11 +14,13 @@ from sb3_belief.report.resampling import METHODS, bootstrap_interval
 from sb3_belief.report.statistics import interquartile_mean
 from sb3_belief.report.verdicts import share_of_wins
 
-#: Distributions of a run's score in environment e: like returns, like success rates, and with a long tail
+#: Distributions of a run's score in environment e: like returns, like success rates, with a long tail, and of runs that either
+#: find the way or do not
 SHAPES: dict[str, Callable[[np.random.Generator, int, tuple[int, ...]], np.ndarray]] = {
     "normal": lambda rng, e, size: rng.normal(0.3 * e, 1 + 0.2 * e, size),
     "beta": lambda rng, e, size: rng.beta(4 - 0.3 * e, 2, size),
     "lognormal": lambda rng, e, size: rng.lognormal(0.1 * e, 0.7, size),
+    "bimodal": lambda rng, e, size: (rng.random(size) < 0.6) * 1.0,
 }
 
 
@@ -71,6 +73,7 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=1000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[2, 3, 4, 5, 10, 20])
     parser.add_argument("--environments", type=int, nargs="+", default=[1, 4])
+    parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=["normal", "beta", "lognormal"])
     arguments = parser.parse_args()
     kinds = " | ".join(METHODS)
     print(f"| environments | seeds | IQM: {kinds} | P(X > Y): {kinds} | wrongly decided: {kinds} |")
@@ -80,7 +83,7 @@ def main() -> None:
             # [methods, shapes, rates]
             found = 100 * np.array(
                 [
-                    [rates(shape, n_environments, n_seeds, method, arguments.repetitions) for shape in SHAPES]
+                    [rates(shape, n_environments, n_seeds, method, arguments.repetitions) for shape in arguments.shapes]
                     for method in METHODS
                 ]
             )
