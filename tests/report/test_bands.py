@@ -38,9 +38,9 @@ def test_evaluations_that_a_seed_has_not_had_are_left_out():
 
 
 def test_overall_curves_are_over_the_share_of_the_training():
-    # Straight lines, normalised: in "short" from 0 to 1 over 100 steps, in "long" over 1,000 steps with other evaluations
+    # Straight lines, normalised: in "short" from 0 to 1 over the 100 steps that all have, in "long" over 1,000 steps
     seeds = [0, 1]
-    short = np.array([0, 50, 100]), np.array([[0.0, 5.0, 10.0]] * 2), seeds
+    short = np.array([0, 50, 100, 150]), np.array([[0.0, 5.0, 10.0, 90.0]] * 2), seeds
     long = np.array([250, 1000]), np.array([[-3.0, -0.0]] * 2), seeds
     unfinished = np.array([0, 100, 200]), np.array([[0.0, 10.0, 99.0], [0.0, 10.0, np.nan]]), seeds
     curves = {"short": {"x": short, "y": unfinished}, "long": {"x": long, "y": long}, "other": {"x": long}}
