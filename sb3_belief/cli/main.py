@@ -1,4 +1,4 @@
-"""Command line: ``sb3-belief train | enjoy | export | envs | demo``."""
+"""Command line: ``sb3-belief train | enjoy | watch | export | envs | demo``."""
 
 import argparse
 import os
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sb3_belief.cli import demo, enjoy, envs, export, train
+from sb3_belief.cli import demo, enjoy, envs, export, train, watch
 from sb3_belief.cli.flags import STYLE, Parser
 from sb3_belief.zoo.errors import ConfigError, RunFailed
 
@@ -30,7 +30,7 @@ _OF_THE_WHOLE_PACKAGE = {"greenlet", "pettingzoo", "sb3_contrib", "supersuit"}
 _CLOSED_PIPE = 141
 
 #: The commands: what their help says, their flags, and what they do
-COMMANDS = {"train": train, "enjoy": enjoy, "export": export, "envs": envs, "demo": demo}
+COMMANDS = {"train": train, "enjoy": enjoy, "watch": watch, "export": export, "envs": envs, "demo": demo}
 
 
 class _Version(argparse.Action):

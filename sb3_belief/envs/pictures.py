@@ -30,6 +30,19 @@ def import_pygame() -> Any:
     return pygame
 
 
+def cell_position(row: int, column: int, rows: int, columns: int) -> tuple[float, float]:
+    """
+    Return where the middle of a cell is in the picture of a grid.
+
+    :param row: Row of the cell, from the top
+    :param column: Column of the cell, from the left
+    :param rows: Number of rows
+    :param columns: Number of columns
+    :return: (x, y) as fractions of the picture's width and height, from the upper left corner
+    """
+    return (column + 0.5) / columns, (row + 0.5) / rows
+
+
 class GridPicture:
     """
     Picture of a grid of square cells.

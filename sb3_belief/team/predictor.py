@@ -46,6 +46,14 @@ class Predictor:
         self.takes_masks = takes_masks(model)
         self._state: PolicyState = None
 
+    def observed(self, obs: Any) -> Any:
+        """
+        Return observations as the model gets them: normalised, if it is.
+
+        :param obs: Observations as the team's environment returns them
+        """
+        return obs if self._statistics is None else self._statistics.normalize_obs(obs)
+
     def predict(
         self,
         obs: np.ndarray,
@@ -64,8 +72,7 @@ class Predictor:
         :param masks: Possible actions, bool ``[n_envs, k]`` or ``[k]``; for models whose ``predict`` takes them
         :return: Action(s) and the next recurrent state
         """
-        if self._statistics is not None:
-            obs = self._statistics.normalize_obs(obs)  # type: ignore[assignment]
+        obs = self.observed(obs)
         kwargs: dict[str, Any] = {} if masks is None or not self.takes_masks else {"action_masks": masks}
         return self._model.predict(obs, state, episode_start, deterministic, **kwargs)
 

@@ -136,6 +136,16 @@ class SB3Protocol:
         """The agents' action spaces by agent."""
         return spaces.Dict({agent: model.action_space for agent, model in self._models.items()})
 
+    def observed_by(self, agent: str, observation: Any) -> Any:
+        """
+        Return an agent's observations as its model gets them, for ``team.agents[agent].policy.predict_others`` and the like.
+
+        :param agent: Name of the agent
+        :param observation: As the team's environment returns them, ``[n_envs, ...]``
+        :return: The same, normalised if the team is
+        """
+        return self._agents.predictor(agent).observed(observation)
+
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """Return None: each agent is normalised by itself, not the environment."""
         return None

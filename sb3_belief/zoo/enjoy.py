@@ -1,62 +1,49 @@
 """Replay of a trained team, in a window or as a GIF or MP4 file."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sb3_belief.common.safe_files.trust import Trust
-from sb3_belief.envs.registry import make_parallel_env, spec
-from sb3_belief.team import Team, TeamVecEnv, make_team_env
-from sb3_belief.zoo.checks import Location, accepted_arguments, check_call
-from sb3_belief.zoo.config import load_config
-from sb3_belief.zoo.errors import ConfigError, cause
+from sb3_belief.report.frames import NoPictureError, frame_of
+from sb3_belief.team import Team, TeamVecEnv
+from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import Outcome
-from sb3_belief.zoo.names import get_env, load_env
 from sb3_belief.zoo.preflight import check_device, check_output
-from sb3_belief.zoo.run_folder import CONFIG, RECORD, check_record, find_team, run_of
-from sb3_belief.zoo.yaml_data import parse_pairs
+from sb3_belief.zoo.replay import (
+    ShownTeam,
+    ShownEnvironment,
+    environment_of,
+    render_modes_of,
+    team_in_its_environment,
+    with_mode,
+)
+from sb3_belief.zoo.run_folder import find_team
 
-# Least side of a picture in pixels, as far as whole factors allow it
-_SIDE = 480
 VIDEO_FORMATS = (".gif", ".mp4")
 
 
 @dataclass(frozen=True)
-class EnjoyOptions:
+class EnjoyOptions(ShownTeam):
     """
-    Options of a replay.
+    Options of a replay, besides the team.
 
-    :param run: Folder of a run, or zip of a team
-    :param env: Id of the environment, for the zip of a team that is not in the folder of a run. None for that of the run
     :param episodes: Number of episodes to play
     :param n_timesteps: Number of steps to play instead, or None
     :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
     :param seed: Seed of the environment
     :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
     :param fps: Frames per second of the file, or None for the environment's own rate
-    :param env_kwargs: ``key:value`` pairs of arguments of the environment, which override those of the run
-    :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
-    :param trust: Whether to load the team, and what its run's folder names, even if that could run any code
-    :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
     """
 
-    run: str
-    env: str | None = None
     episodes: int = 1
     n_timesteps: int | None = None
     deterministic: bool = True
     seed: int = 0
     output: str | None = None
     fps: int | None = None
-    env_kwargs: tuple[str, ...] = ()
-    extra_packages: tuple[str, ...] = ()
-    trust: bool = False
-    device: str = "auto"
 
 
 def enjoy(options: EnjoyOptions) -> Outcome:
@@ -73,21 +60,13 @@ def enjoy(options: EnjoyOptions) -> Outcome:
         check_output(options.output, "--output")
     check_device(options.device)
     path = find_team(options.run, "enjoy")
-    shown = _environment_of(path, options)
-    shown = _with_render_mode(shown, options)
-    with _refusals_as_config_errors(shown):
-        env = make_team_env(shown.env_id, seed=options.seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
-    try:
-        team = _load_team(path, env, options)
-        # This comes after loading, which seeds the environment as in the training
-        env.seed(options.seed)
+    shown = _with_render_mode(environment_of(path, options, "enjoy"), options)
+    with team_in_its_environment(path, shown, options, options.seed, "enjoy") as (team, env):
         frames: list[np.ndarray] | None = None if options.output is None else []
         outcome = _play(team, env, options, frames)
         if options.output is not None and frames:
             write_video(Path(options.output), frames, options.fps or shown.frame_rate)
             print(f"Wrote {len(frames)} frames to {options.output}")
-    finally:
-        env.close()
     _print_summary(outcome)
     return outcome
 
@@ -113,83 +92,17 @@ def write_video(path: Path, frames: list[np.ndarray], fps: int) -> None:
         imageio.mimsave(path, frames, fps=fps, macro_block_size=2)  # type: ignore[arg-type]
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """
-    The environment of a replay.
-
-    :param env_id: Its id
-    :param env_kwargs: Its arguments
-    :param wrapper: Argument of ``make_team_env``
-    :param frame_rate: Frames per second
-    """
-
-    env_id: str
-    env_kwargs: dict[str, Any]
-    wrapper: Callable[[Any], Any] | None
-    frame_rate: int = 10
-
-
-def _environment_of(team: Path, options: EnjoyOptions) -> _Shown:
-    packages = options.extra_packages
-    if options.env is not None:
-        make_env = load_env(options.env, "--env", packages)
-        given, n_leading = parse_pairs(options.env_kwargs, "--env-kwargs"), len(get_env(options.env, "--env").leading)
-        return _Shown(
-            options.env, check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading, of_env=True), None
-        )
-    run = run_of(team)
-    if run is None:
-        raise ConfigError(
-            f"enjoy: {str(team)!r} is not in the folder of a run (no {CONFIG} and {RECORD}), so its environment is unknown:"
-            " name it with --env, and its arguments with --env-kwargs."
-        )
-    algo, env_id, conf_file = run
-    check_record(run, packages, trust=options.trust)
-    folder = None if options.trust else conf_file.parent
-    config = load_config(
-        algo, env_id, str(conf_file), env_kwargs=options.env_kwargs, extra_packages=packages, run_folder=folder
-    )
-    return _Shown(config.env_id, config.env_kwargs, config.wrapper)
-
-
-def _with_render_mode(shown: _Shown, options: EnjoyOptions) -> _Shown:
+def _with_render_mode(shown: ShownEnvironment, options: EnjoyOptions) -> ShownEnvironment:
     """Add a render mode, if the environment has one for what is asked, and its frame rate."""
-    # SB3's vectorised environments do not pass on the metadata, so it is read from a single copy
-    with _refusals_as_config_errors(shown):
-        env = make_parallel_env(shown.env_id, **shown.env_kwargs)
-    arguments, open_ended = accepted_arguments(spec(shown.env_id).load())
-    # An environment may render and still be made by a callable that does not take a render mode
-    takes_mode = open_ended or "render_mode" in arguments
-    modes = list(env.metadata.get("render_modes", [])) if takes_mode else []
-    shown = replace(shown, frame_rate=int(env.metadata.get("render_fps", 10)))
-    env.close()
+    shown, modes = render_modes_of(shown, "enjoy")
     wanted = "human" if options.output is None else "rgb_array"
     if wanted in modes:
-        return replace(shown, env_kwargs={**shown.env_kwargs, "render_mode": wanted})
+        return with_mode(shown, wanted)
     if options.output is not None:
         raise ConfigError(f"enjoy: {shown.env_id} has no images to write to {options.output!r}; leave out --output.")
     instead = " Write a file instead: --output episode.gif" if "rgb_array" in modes else ""
     print(f"Nothing is shown: {shown.env_id} has no render mode 'human'.{instead}")
     return shown
-
-
-def _load_team(path: Path, env: TeamVecEnv, options: EnjoyOptions) -> Team:
-    try:
-        trust = Trust.of(options.trust, options.extra_packages)
-        return Team.load(path, env=env, device=options.device, **trust._asdict())
-    # A damaged file makes zipfile, pickle and torch raise whatever they raise
-    except Exception as error:
-        raise ConfigError(f"enjoy: {str(path)!r} cannot be loaded: {cause(error)}") from error
-
-
-@contextmanager
-def _refusals_as_config_errors(shown: _Shown) -> Iterator[None]:
-    try:
-        yield
-    # An environment of the user's own may raise anything
-    except Exception as error:
-        raise ConfigError(f"enjoy: {shown.env_id} refuses its settings: {cause(error)}") from error
 
 
 def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.ndarray] | None) -> Outcome:
@@ -230,14 +143,10 @@ def _is_of_window(error: Exception) -> bool:
 
 
 def _frame(env: TeamVecEnv) -> np.ndarray:
-    image = env.get_images()[0]
-    frame = None if image is None else np.asarray(image)
-    if frame is None or frame.ndim != 3 or frame.shape[2] not in (3, 4):
-        found = type(image).__name__ if frame is None else f"an array of shape {frame.shape}"
-        raise ConfigError(f"enjoy: the environment's render() returned {found}, not an image [height, width, 3].")
-    # Small pictures, such as those of grids with a pixel a cell, are enlarged by a whole number, which keeps their edges
-    factor = max(1, _SIDE // max(frame.shape[:2]))
-    return frame[..., :3].astype(np.uint8).repeat(factor, axis=0).repeat(factor, axis=1)
+    try:
+        return frame_of(env)
+    except NoPictureError as error:
+        raise ConfigError(f"enjoy: {error}") from error
 
 
 def _warn_if_hidden() -> None:

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
-from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture
+from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture, cell_position
 
 _FOOD = (196, 60, 52)
 
@@ -24,6 +24,7 @@ class Foraging(DrawnTupleEnv):
     The team's reward is the sum over the agents: 1 for an episode in which all food is collected.
     """
 
+    action_names: ClassVar[tuple[str, ...]] = ("none", "north", "south", "west", "east", "load")
     state_names: ClassVar[tuple[str, ...]] = (
         "field",
         "players",
@@ -65,6 +66,15 @@ class Foraging(DrawnTupleEnv):
         for index, player in enumerate(self.game.players):
             picture.disc(player.position[0], player.position[1], AGENT_COLOURS[index % len(AGENT_COLOURS)], str(player.level))
         return picture.image()
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the players are in the picture.
+
+        :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
+        """
+        players = zip(self.possible_agents, self.game.players, strict=True)
+        return {agent: cell_position(*player.position, *self.game.field.shape) for agent, player in players}
 
     def _is_success(self) -> bool:
         return not self.game.field.any()

@@ -78,6 +78,25 @@ class MpeParallelEnv(aec_to_parallel_wrapper):
     and all agents end together.
     """
 
+    @property
+    def action_names(self) -> dict[str, list[str]]:
+        """The names of the actions of agents that move, and do nothing else."""
+        moves = ["nothing", "left", "right", "down", "up"]
+        agents = zip(self.possible_agents, self.aec_env.unwrapped.world.agents, strict=True)
+        return {name: moves for name, agent in agents if agent.movable and agent.silent}
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the agents are in the picture.
+
+        :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
+        """
+        world = self.aec_env.unwrapped.world
+        # As mpe2 draws: what is farthest from the centre determines the scale
+        scale = 0.45 / float(np.max(np.abs([entity.state.p_pos for entity in world.entities])))
+        places = [agent.state.p_pos * scale for agent in world.agents]
+        return {agent: (0.5 + x, 0.5 - y) for agent, (x, y) in zip(self.possible_agents, places, strict=True)}
+
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
         Let all agents act and return the results of the world's step.

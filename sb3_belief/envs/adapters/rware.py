@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_belief.envs.adapters.gym_tuple import DrawnTupleEnv, make_registered
-from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture
+from sb3_belief.envs.pictures import AGENT_COLOURS, GridPicture, cell_position
 
 _GOAL, _SHELF, _REQUESTED = (60, 60, 60), (160, 150, 200), (32, 140, 130)
 # Steps (rows, columns) to which a robot looks
@@ -25,6 +25,7 @@ class Warehouse(DrawnTupleEnv):
     it is their mean. Either way it counts the delivered shelves.
     """
 
+    action_names: ClassVar[tuple[str, ...]] = ("noop", "forward", "left", "right", "toggle load")
     state_names: ClassVar[tuple[str, ...]] = (
         "grid",
         "agents",
@@ -55,6 +56,15 @@ class Warehouse(DrawnTupleEnv):
             colour = AGENT_COLOURS[index % len(AGENT_COLOURS)]
             picture.disc(robot.y, robot.x, colour, "*" if robot.carrying_shelf else "", _HEADINGS[robot.dir.name])
         return picture.image()
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the robots are in the picture.
+
+        :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
+        """
+        robots = zip(self.possible_agents, self.game.agents, strict=True)
+        return {agent: cell_position(robot.y, robot.x, *self.game.grid_size) for agent, robot in robots}
 
     def _is_time_limit(self) -> bool:
         return True

@@ -9,9 +9,10 @@ from sb3_belief.envs.base import ResetResult, StepResult, TeamGame, check_render
 from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
-from sb3_belief.envs.traffic_junction.rendering import Renderer
+from sb3_belief.envs.traffic_junction.rendering import Renderer, positions_in_picture
 
 RENDER_MODES = ("human", "rgb_array")
+ACTION_NAMES = ("gas", "brake")
 
 
 class TrafficJunction(TeamGame[np.ndarray, int]):
@@ -76,6 +77,7 @@ class TrafficJunction(TeamGame[np.ndarray, int]):
         "is_parallelizable": True,
         "render_fps": 6,
     }
+    action_names = ACTION_NAMES
 
     def __init__(
         self,
@@ -217,6 +219,14 @@ class TrafficJunction(TeamGame[np.ndarray, int]):
             self._renderer.show(self.core, 0, fps=self.metadata["render_fps"])
             return None
         return self._renderer.image(self.core, 0)
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the cars are in the picture.
+
+        :return: {agent: (x, y)} of the slots with a car, as fractions of its width and height, from the upper left corner
+        """
+        return positions_in_picture(self.core, 0, self.possible_agents)
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -1,6 +1,7 @@
 """Pictures of a Traffic Junction that are drawn with pygame."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -229,6 +230,23 @@ class Renderer:
             # The font that pygame ships makes the picture independent of the fonts of the system
             self._fonts[size] = self.pygame.font.Font(None, round(1.3 * size))
         return self._fonts[size]
+
+
+def positions_in_picture(core: TrafficCore, copy: int, names: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """
+    Return where the cars are in the picture of one copy.
+
+    :param core: The copies
+    :param copy: Index of the copy
+    :param names: Names of the slots
+    :return: {name: (x, y)} of the slots with a car, as fractions of the picture's width and height, from the upper left corner
+    """
+    size, height = core.layout.level.size, WIDTH + HUD_HEIGHT
+    found = {}
+    for slot in np.flatnonzero(core.on_road[copy]):
+        row, column = divmod(int(core.layout.cell[core.place[copy, slot]]), size)
+        found[names[slot]] = (column + 0.5) / size, (HUD_HEIGHT + (row + 0.5) * WIDTH / size) / height
+    return found
 
 
 def _headings(layout: Layout) -> np.ndarray:

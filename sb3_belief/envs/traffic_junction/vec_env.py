@@ -11,12 +11,13 @@ from sb3_belief.envs.traffic_junction.config import JunctionConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, Step, TrafficCore
 from sb3_belief.envs.traffic_junction.observation import Observer
 from sb3_belief.envs.traffic_junction.parallel_env import (
+    ACTION_NAMES,
     RENDER_MODES,
     TrafficJunction,
     action_masks,
     agent_names,
 )
-from sb3_belief.envs.traffic_junction.rendering import Renderer
+from sb3_belief.envs.traffic_junction.rendering import Renderer, positions_in_picture
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 
@@ -32,6 +33,8 @@ class TrafficJunctionVecEnv(BatchedVecEnv):
     :param env_kwargs: The other arguments of :class:`TrafficJunction`
     :raises ValueError: For a value that is not allowed
     """
+
+    action_names = ACTION_NAMES
 
     def __init__(self, num_envs: int, render_mode: str | None = None, **env_kwargs: Any):
         if num_envs < 1:
@@ -119,6 +122,14 @@ class TrafficJunctionVecEnv(BatchedVecEnv):
         :return: One array per copy, uint8 [height, width, 3]
         """
         return [self._get_renderer().image(self.core, copy) for copy in range(self.num_envs)]
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the cars are in the picture of the first copy, as :meth:`TrafficJunction.picture_positions` does.
+
+        :return: {agent: (x, y)}
+        """
+        return positions_in_picture(self.core, 0, self.possible_agents)
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
         """

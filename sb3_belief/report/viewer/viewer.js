@@ -1,0 +1,394 @@
+"use strict";
+const D = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+const MANY = 4; // more others than this: those that are not seen are folded
+
+/** Make an element. Texts are set as text, so that no name can be taken for HTML. */
+function make(tag, properties = {}, ...children) {
+  const element = tag.startsWith("svg:") ? document.createElementNS(SVG, tag.slice(4)) : document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name === "text") element.textContent = value;
+    else if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child));
+  return element;
+}
+const percent = (share) => `${Math.round(100 * share)} %`;
+const short = (number) => String(Number(Number(number).toPrecision(3)));
+const all = (flags) => flags.every(Boolean);
+const names = Object.keys(D.agents);
+const offsets = D.episodes.map((_, e) => D.episodes.slice(0, e).reduce((sum, episode) => sum + episode.steps.length, 0));
+const images = D.frames.map((url) => { const image = new Image(); image.src = url; return image; });
+const now = { episode: 0, step: 0, agent: names[0] };
+let timer = null;
+
+const steps = () => D.episodes[now.episode].steps;
+const view = (step = now.step) => steps()[step].views[now.agent];
+const agent = () => D.agents[now.agent];
+/** 1 right, 0 wrong, null where it cannot be said: not seen, or no action that is right or wrong. */
+const verdict = (seen, k) => (seen.right && seen.right[k] ? (all(seen.right[k]) ? 1 : 0) : null);
+const WORDS = { 1: ["right", "✓ right"], 0: ["wrong", "✗ wrong"] };
+
+// Bars
+
+/** Label of an action, such as "gas" or "2 / left". */
+function label(name, action) {
+  const space = D.spaces[name];
+  if (space.kind === "number") return action.map(short).join(", ");
+  if (space.kind === "binary") return space.labels[0].filter((_, k) => action[k]).join(" + ") || "none";
+  return action.map((index, part) => space.labels[part][index]).join(" / ");
+}
+
+/** One group of bars for each part of an action space: how likely each action is, and which was done. */
+function bars(name, numbers, did, kind) {
+  const space = D.spaces[name];
+  if (space.kind === "number") return numberBars(space, numbers, did);
+  const box = make("div");
+  let start = 0;
+  space.labels.forEach((labels, part) => {
+    const values = numbers.slice(start, start + labels.length);
+    start += labels.length;
+    const low = kind === "values" ? Math.min(...values) : 0;
+    const size = kind === "values" ? Math.max(...values) - low || 1 : 1;
+    const most = values.indexOf(Math.max(...values));
+    const done = (k) => did && (space.kind === "binary" ? did[k] === 1 : did[part] === k);
+    const top = (k) => (space.kind === "binary" ? values[k] > 0.5 : k === most);
+    let shown = labels.map((_, k) => k);
+    if (shown.length > 8) shown = shown.sort((a, b) => values[b] - values[a]).filter((k, rank) => rank < 6 || done(k)).sort((a, b) => a - b);
+    if (space.labels.length > 1) box.append(make("div", { class: "part", text: `part ${part}` }));
+    const group = make("div", { class: "bars" });
+    for (const k of shown) {
+      const text = kind === "values" ? short(values[k]) : percent(values[k]);
+      const mark = done(k) ? "◆ " : "";
+      group.append(make("div", { class: `bar${top(k) ? " top" : ""}${done(k) ? " did" : ""}`, title: `${labels[k]}: ${text}${done(k) ? ", and so it did" : ""}` },
+        make("span", { text: mark + labels[k] }),
+        make("i", {}, make("b", { style: `width:${Math.max(0, Math.min(1, (values[k] - low) / size)) * 100}%` })),
+        make("span", { text })));
+    }
+    if (shown.length < labels.length) group.append(make("div", { class: "part", text: `and ${labels.length - shown.length} less likely actions` }));
+    box.append(group);
+  });
+  return box;
+}
+
+/** A scale for each number of a continuous action: the bar is what was done, the square what was expected. */
+function numberBars(space, numbers, did) {
+  const group = make("div", { class: "bars" });
+  space.low.slice(0, 8).forEach((low, k) => {
+    const values = [numbers[k], did && did[k]].filter((value) => value !== undefined && value !== null);
+    const least = Math.min(low, ...values), most = Math.max(space.high[k], ...values);
+    const at = (value) => `left:${(100 * (value - least)) / (most - least || 1)}%`;
+    const expected = numbers[k] === undefined ? null : make("s", { style: at(numbers[k]) });
+    group.append(make("div", { class: "bar", title: values.map(short).join(", did ") },
+      make("span", { text: `number ${k}` }),
+      make("i", {}, did ? make("u", { style: at(did[k]) }) : null, expected),
+      make("span", { text: short(values[0]) })));
+  });
+  return group;
+}
+
+// The picture
+
+function drawFrame() {
+  const step = steps()[now.step];
+  const image = $("frame");
+  image.src = D.frames[step.frame];
+  image.alt = `The environment at step ${now.step + 1}`;
+  const svg = $("overlay");
+  svg.replaceChildren();
+  const shown = images[step.frame];
+  if (!shown.naturalWidth) { shown.addEventListener("load", draw, { once: true }); return; }
+  const height = (100 * shown.naturalHeight) / shown.naturalWidth;
+  svg.setAttribute("viewBox", `0 0 100 ${height}`);
+  const at = (name) => step.at[name] && [100 * step.at[name][0], height * step.at[name][1]];
+  const me = at(now.agent), seen = view(), r = radius(height);
+  const circle = (place, size, kind) => make("svg:circle", { cx: place[0], cy: place[1], r: size, class: kind });
+  agent().others.forEach((other, k) => {
+    const place = at(other);
+    if (!place || !me || !seen.sees[k] || !seen.active) return;
+    const how = verdict(seen, k), kind = how === null ? "none" : WORDS[how][0];
+    svg.append(make("svg:line", { x1: me[0], y1: me[1], x2: place[0], y2: place[1], class: "sight" }));
+    svg.append(circle(place, r, "ring under"), circle(place, r, `ring line-${kind}`));
+    if (how !== null) {
+      const corner = [Math.min(place[0] + 0.75 * r, 97), Math.max(place[1] - 0.75 * r, 3)];
+      svg.append(circle(corner, 2.1, `badge fill-${kind}`));
+      svg.append(make("svg:text", { x: corner[0], y: corner[1], "font-size": 2.9, text: how ? "✓" : "✗" }));
+    }
+  });
+  if (me) svg.append(circle(me, r * 1.15, "chosen"), circle(me, r * 1.15, "chosen inner"));
+  for (const name of names) {
+    const place = at(name);
+    if (!place) continue;
+    const target = circle(place, r * 1.2, "who");
+    target.append(make("svg:title", { text: name }));
+    target.addEventListener("click", () => choose(name));
+    svg.append(target);
+  }
+}
+
+let radiusKept = null;
+/** Radius of the rings: half of the least distance of two different places, which is half a cell of a grid. */
+function radius(height) {
+  if (radiusKept === null) {
+    const places = [...new Set(D.episodes.flatMap((e) => e.steps.flatMap((s) => Object.values(s.at).map((p) => p.join()))))].slice(0, 400);
+    const points = places.map((text) => text.split(",").map(Number));
+    let least = Infinity;
+    points.forEach((p, i) => points.slice(i + 1).forEach((q) => {
+      const distance = Math.hypot(100 * (p[0] - q[0]), height * (p[1] - q[1]));
+      if (distance > 0.5) least = Math.min(least, distance);
+    }));
+    radiusKept = Math.max(3.2, Math.min(7, 0.52 * least));
+  }
+  return radiusKept;
+}
+
+// Time
+
+/** The tracks: the team's reward, and of each other whether the agent was right. */
+function buildTimeline() {
+  const box = $("timeline"), n = steps().length;
+  const track = (name, title, cells) => make("div", { class: "track", "data-name": name, title },
+    make("span", { text: name }), make("svg:svg", { viewBox: `0 0 ${n} 1`, preserveAspectRatio: "none", "aria-hidden": "true" }, ...cells));
+  const cell = (t, height, kind, y = 1 - height) => make("svg:rect", { x: t + 0.06, y, width: 0.88, height, class: kind });
+  const rewards = steps().map((step) => step.reward);
+  const low = Math.min(0, ...rewards), size = Math.max(0, ...rewards) - low || 1;
+  const zero = 1 + low / size;
+  const tracks = [track("reward", "The team's reward at each step", rewards.map((reward, t) =>
+    cell(t, Math.max(Math.abs(reward) / size, 0.03), "amount", reward > 0 ? zero - reward / size : Math.min(zero, 0.97))))];
+  if (agent().belief) {
+    const errors = steps().flatMap((_, t) => view(t).error).filter((error) => error !== null);
+    const worst = Math.max(...errors, 1e-9);
+    agent().others.forEach((other, k) => {
+      const cells = [];
+      let right = 0, total = 0;
+      steps().forEach((_, t) => {
+        const seen = view(t), how = verdict(seen, k);
+        // Height tells right from wrong too
+        if (how !== null) { total += 1; right += how; cells.push(cell(t, how ? 0.5 : 1, WORDS[how][0])); }
+        else if (seen.active && seen.sees[k] && seen.error[k] !== null) cells.push(cell(t, Math.max(seen.error[k] / worst, 0.06), "amount"));
+        else cells.push(cell(t, 0.07, "blank"));
+      });
+      tracks.push(track(other, total ? `${other}: right at ${right} of ${total} steps` : other, cells));
+    });
+  }
+  box.className = tracks.length > 9 ? "many" : "";
+  box.replaceChildren(...tracks, make("div", { id: "head" }));
+  box.setAttribute("aria-valuemax", n - 1);
+}
+
+function placeHead() {
+  const lane = $("timeline").querySelector("svg"), head = $("head"), width = lane.clientWidth || lane.getBoundingClientRect().width;
+  const left = lane.getBoundingClientRect().left - $("timeline").getBoundingClientRect().left;
+  head.style.left = `${left + (width * now.step) / steps().length - 2}px`;
+  head.style.width = `${width / steps().length + 4}px`;
+  $("timeline").setAttribute("aria-valuenow", now.step);
+  $("timeline").setAttribute("aria-valuetext", `step ${now.step + 1} of ${steps().length}`);
+}
+
+function stepAt(event) {
+  const lane = $("timeline").querySelector("svg").getBoundingClientRect();
+  return Math.floor((steps().length * (event.clientX - lane.left)) / lane.width);
+}
+
+// The panels
+
+function drawAgents() {
+  const step = steps()[now.step];
+  const focused = document.activeElement && document.activeElement.dataset.agent;
+  $("agents").replaceChildren(...names.map((name) => make("button", {
+    type: "button", role: "radio", "aria-checked": String(name === now.agent), "data-agent": name, text: name,
+    class: step.views[name].active ? "" : "idle", title: `${name} (${D.agents[name].algorithm})${step.views[name].active ? "" : ", not in play"}`,
+    onclick: () => choose(name),
+  })));
+  if (focused) [...$("agents").children].find((button) => button.dataset.agent === focused)?.focus();
+}
+
+function drawOwn() {
+  const seen = view(), did = steps()[now.step].did[now.agent], own = seen.own;
+  $("own-title").textContent = `What ${now.agent} would do, and does: ${label(now.agent, did)}`;
+  const facts = make("p", { id: "own-facts", class: "quiet" },
+    make("span", { text: `reward ${short(seen.reward)}` }),
+    seen.value === null ? null : make("span", { text: `its value of this state ${short(seen.value)}` }),
+    make("span", { text: agent().algorithm }));
+  const box = own.kind ? bars(now.agent, own.numbers, did, own.kind) : make("p", { class: "quiet", text: "Its policy gives no probabilities." });
+  $("own").replaceChildren(...[own.kind === "values" ? make("p", { class: "quiet", text: "Values of its actions:" }) : null, box, facts].filter(Boolean));
+}
+
+function drawOthers() {
+  const seen = view(), step = steps()[now.step], believes = Boolean(agent().belief);
+  $("others-title").textContent = believes ? `What ${now.agent} believes that the others will do` : `What the others do`;
+  const folded = [];
+  const cards = agent().others.map((other, k) => {
+    const sees = seen.sees[k] && seen.active, how = believes ? verdict(seen, k) : null;
+    if (!sees && agent().others.length > MANY) { folded.push(other); return null; }
+    const word = !sees ? "not seen" : how === null ? "seen" : WORDS[how][1];
+    const kind = how === null ? "" : WORDS[how][0];
+    const did = `${sees ? "did" : "does, unseen:"} ${label(other, step.did[other])}`;
+    const error = believes && seen.error[k] !== null ? `, off by ${short(seen.error[k])}` : "";
+    return make("article", { class: `card ${kind}${sees ? "" : " dim"}`, "data-other": other, "aria-label": `${other}: ${word}` },
+      make("h3", {}, make("span", { text: other }), make("span", { class: `tag ${kind}`, text: word })),
+      believes ? bars(other, seen.expects[k], step.did[other]) : null,
+      make("div", { class: "quiet", text: `◆ ${did}${error}` }));
+  }).filter(Boolean);
+  $("others").replaceChildren(...cards);
+  $("unseen").textContent = folded.length ? `Not seen: ${folded.join(", ")}` : "";
+}
+
+function drawScore() {
+  const counts = (until) => {
+    let right = 0, total = 0;
+    const done = new Map();
+    for (let t = 0; t < until; t += 1) {
+      (view(t).right || []).forEach((parts, k) => (parts || []).forEach((flag, part) => {
+        right += flag; total += 1;
+        const key = `${k} ${part}`, action = steps()[t].did[agent().others[k]][part];
+        if (!done.has(key)) done.set(key, new Map());
+        done.get(key).set(action, (done.get(key).get(action) || 0) + 1);
+      }));
+    }
+    const frequent = [...done.values()].reduce((sum, actions) => sum + Math.max(...actions.values()), 0);
+    return { right, total, frequent };
+  };
+  const so = counts(now.step + 1), whole = counts(steps().length);
+  const parts = [];
+  if (!agent().belief) parts.push(`${now.agent} has no belief about the others.`);
+  else if (whole.total) {
+    parts.push(make("strong", { text: so.total ? percent(so.right / so.total) : "–" }), ` right so far (${so.right} of ${so.total}); whole episode ${percent(whole.right / whole.total)}, `);
+    parts.push(`always naming each other's most frequent action ${percent(whole.frequent / whole.total)}`);
+  }
+  $("score").replaceChildren(...parts);
+}
+
+function drawMemory() {
+  const seen = view(), cards = agent().cards;
+  $("memory-panel").hidden = !agent().belief;
+  const rows = cards ? seen.rows : [];
+  $("memory-note").textContent = cards
+    ? `${rows.length} of the last ${agent().history} steps in which it was in play, the newest on the right; the higher, the more weight.`
+    : "This belief has no history, or an empty one: it follows from the observation alone.";
+  const most = rows.length ? rows[0][1] : 1;
+  $("rows").replaceChildren(...(cards ? [make("svg:svg", { viewBox: `0 0 ${agent().history} 1`, preserveAspectRatio: "none", role: "img", "aria-label": `Weights of ${rows.length} history rows` },
+    ...rows.map(([row, weight]) => make("svg:rect", { x: row, width: Math.max(agent().history / 250, 1), y: 1 - weight / most, height: weight / most })))] : []));
+  const shown = rows.filter(([row]) => cards[row]).slice(0, 6);
+  const rest = rows.slice(shown.length).reduce((sum, [, weight]) => sum + weight, 0);
+  $("memory").replaceChildren(...shown.map(([row, weight]) => memoryCard(row, weight, cards[row], weight / most)));
+  if (rows.length > shown.length) $("memory").append(make("p", { class: "quiet sum", text: `The other ${rows.length - shown.length} rows together: ${percent(rest)} of the weight.` }));
+}
+
+function memoryCard(row, weight, card, share) {
+  const [like, same] = card.like;
+  const episode = offsets.findLastIndex((start) => start <= like), step = like - offsets[episode];
+  const chips = agent().others.map((other, k) => card.did[k] && make("span", { class: "chip", text: `${other}: ${label(other, card.did[k])}` })).filter(Boolean);
+  const place = `step ${step + 1}${D.episodes.length > 1 ? ` of episode ${episode + 1}` : ""}`;
+  const canvas = make("canvas", { width: 96, height: 2, role: "img", "aria-label": "Observation now (above) and then (below)", title: "Its observation now (above) and then (below)" });
+  drawStrip(canvas, agent().now[offsets[now.episode] + now.step], card.seen);
+  return make("article", { class: "card", "data-row": row },
+    make("h3", {}, make("span", { text: `${card.age} ${card.age === 1 ? "step" : "steps"} back` }), make("span", { class: "tag", text: `${(100 * weight).toFixed(1)} %` })),
+    make("div", { class: "weight" }, make("b", { style: `width:${100 * share}%` })),
+    make("div", { class: "chips" }, ...(chips.length ? chips : [make("span", { class: "quiet", text: "it saw nobody act" })])),
+    canvas,
+    make("button", { type: "button", class: "jump", onclick: () => go(step, episode), text: "" },
+      `${same ? "observed the same as at" : "most like"} ${place}`,
+      same ? make("img", { src: D.frames[D.episodes[episode].steps[step].frame], alt: `The environment at ${place}` }) : null));
+}
+
+function drawStrip(canvas, above, below) {
+  const rows = [above, below].map((text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
+  canvas.width = Math.max(rows[0].length, 1);
+  const context = canvas.getContext("2d");
+  rows.forEach((row, y) => row.forEach((level, x) => {
+    context.fillStyle = `hsl(216 55% ${92 - (66 * level) / 255}%)`;
+    context.fillRect(x, y, 1, 1);
+  }));
+}
+
+function draw() {
+  const step = steps()[now.step];
+  drawFrame();
+  drawAgents();
+  $("step").textContent = `step ${now.step + 1} of ${steps().length}`;
+  $("status").textContent = view().active ? "" : `${now.agent} is not in play at this step.`;
+  for (const id of ["own-panel", "others-panel"]) $(id).style.opacity = view().active ? 1 : 0.5;
+  document.querySelectorAll(".track").forEach((track) => {
+    const k = agent().others.indexOf(track.dataset.name);
+    track.classList.toggle("seen", k >= 0 && step.views[now.agent].sees[k] && step.views[now.agent].active);
+  });
+  drawOwn(); drawOthers(); drawScore(); drawMemory(); placeHead();
+  try { history.replaceState(null, "", `#episode=${now.episode + 1}&step=${now.step + 1}&agent=${encodeURIComponent(now.agent)}`); } catch { /* not everywhere */ }
+}
+
+// What the user does
+
+function go(step, episode = now.episode) {
+  const moved = episode !== now.episode;
+  now.episode = episode;
+  now.step = Math.max(0, Math.min(steps().length - 1, step));
+  if (moved) { $("episode").value = episode; drawOutcome(); buildTimeline(); }
+  draw();
+}
+function choose(name) { now.agent = name; buildTimeline(); draw(); }
+function pause() { clearInterval(timer); timer = null; showPlaying(); }
+function play() {
+  if (now.step === steps().length - 1) go(0);
+  timer = setInterval(() => (now.step < steps().length - 1 ? go(now.step + 1) : pause()), 1000 / Number($("speed").value));
+  showPlaying();
+}
+function showPlaying() {
+  $("play").textContent = timer ? "⏸\uFE0E" : "▶\uFE0E";
+  $("play").setAttribute("aria-label", timer ? "Pause" : "Play");
+}
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  $("theme").textContent = theme === "dark" ? "☀\uFE0E light" : "☾\uFE0E dark";
+}
+function drawOutcome() {
+  const episode = D.episodes[now.episode];
+  const success = episode.success === null ? null : make("span", { class: `tag ${episode.success ? "right" : "wrong"}`, text: episode.success ? "✓ success" : "✗ no success" });
+  $("outcome").replaceChildren(...[make("span", { class: "tag", text: `return ${short(episode.return)}` }), make("span", { class: "tag", text: `${steps().length} steps` }), success].filter(Boolean));
+}
+
+/** The step at which the page opens: where the agent sees most others. */
+function bestStep(name) {
+  const counts = steps().map((step) => (step.views[name].active ? step.views[name].sees.filter(Boolean).length : -1));
+  return counts.indexOf(Math.max(...counts));
+}
+
+function start() {
+  $("title").textContent = D.title;
+  $("subtitle").textContent = D.subtitle;
+  $("episode").append(...D.episodes.map((_, e) => make("option", { value: e, text: `episode ${e + 1}` })));
+  $("episode").hidden = D.episodes.length < 2;
+  const asked = new URLSearchParams(location.hash.slice(1));
+  now.episode = Math.max(0, Math.min(D.episodes.length - 1, Number(asked.get("episode") || 1) - 1));
+  now.agent = D.agents[asked.get("agent")] ? asked.get("agent") : D.agent;
+  now.step = asked.get("step") ? Math.max(0, Math.min(steps().length - 1, Number(asked.get("step")) - 1)) : bestStep(now.agent);
+  $("episode").value = now.episode;
+  $("legend").replaceChildren(make("b", { class: "r", text: "✓ low" }), " the most likely action is what it did  ", make("b", { class: "w", text: "✗ high" }), " it did something else  – not seen");
+  $("first").onclick = () => go(0);
+  $("back").onclick = () => go(now.step - 1);
+  $("forward").onclick = () => go(now.step + 1);
+  $("last").onclick = () => go(steps().length - 1);
+  $("play").onclick = () => (timer ? pause() : play());
+  $("speed").onchange = () => { if (timer) { clearInterval(timer); play(); } };
+  $("episode").onchange = (event) => { pause(); go(0, Number(event.target.value)); };
+  $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  $("timeline").onpointerdown = (event) => { $("timeline").setPointerCapture(event.pointerId); go(stepAt(event)); };
+  $("timeline").onpointermove = (event) => { if (event.buttons) go(stepAt(event)); };
+  window.addEventListener("resize", placeHead);
+  document.addEventListener("keydown", (event) => {
+    if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
+    const turn = (by) => choose(names[(names.indexOf(now.agent) + by + names.length) % names.length]);
+    const keys = {
+      " ": () => (timer ? pause() : play()), ArrowRight: () => go(now.step + 1), ArrowLeft: () => go(now.step - 1), Home: () => go(0),
+      End: () => go(steps().length - 1), ArrowUp: () => turn(-1), ArrowDown: () => turn(1), t: () => $("theme").click(),
+    };
+    if (!keys[event.key] || (event.key === " " && event.target.tagName === "BUTTON" && event.target.id !== "play")) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+  setTheme(window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  drawOutcome(); buildTimeline(); showPlaying(); draw();
+}
+start();
