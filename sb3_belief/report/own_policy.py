@@ -47,7 +47,7 @@ def own_choice(
         tensor, _ = policy.obs_to_tensor(observation)
         if hasattr(policy, "get_distribution"):
             if hasattr(policy, "lstm_actor"):
-                distribution = policy.get_distribution(tensor, *_recurrent_state(policy, state, episode_start))
+                distribution, _ = policy.get_distribution(tensor, *_recurrent_state(policy, state, episode_start))
                 # predict() keeps the actor's state only
                 value = None
             else:

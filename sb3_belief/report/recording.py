@@ -18,6 +18,7 @@ from sb3_belief.common.action_encoding import action_encoding
 from sb3_belief.report.frames import FrameStore, frame_of
 from sb3_belief.report.own_policy import OwnChoice, own_choice
 from sb3_belief.team import Team, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import JointObs
 
 
 class AgentMoment(NamedTuple):
@@ -132,14 +133,15 @@ def record_episodes(
     recorded: list[Episode] = []
     recording = Recording(team, action_spaces, _action_names(env, action_spaces), FrameStore(), recorded, deterministic)
     tells_positions = env.has_attr("picture_positions")
-    obs, state, episode_start = env.reset(), None, np.ones(1, dtype=bool)
+    state: dict[str, Any] | None = None
+    obs, episode_start = env.reset(), np.ones(1, dtype=bool)
     moments: list[Moment] = []
     while len(recorded) < episodes:
         frame = recording.frames.add(frame_of(env))
         positions = env.env_method("picture_positions")[0] if tells_positions else {}
         masks = env.action_masks()
         before = {
-            agent: _before_acting(team, agent, obs[agent], masks, (state or {}).get(agent), episode_start)
+            agent: _before_acting(team, agent, obs[agent], masks, (state or {}).get(agent), _starts(obs, agent, episode_start))
             for agent in env.possible_agents
         }
         actions, state = team.predict(obs, state, episode_start, deterministic, action_masks=masks)
@@ -175,6 +177,12 @@ def record_episodes(
     return recording
 
 
+def _starts(obs: Any, agent: str, episode_start: np.ndarray) -> np.ndarray:
+    """Return where an agent's recurrent state starts anew: with the team's episode, and where its own return has ended."""
+    ends = obs.life_ends(agent) if isinstance(obs, JointObs) else None
+    return episode_start if ends is None else episode_start | ends
+
+
 def _before_acting(
     team: Team,
     agent: str,
@@ -189,7 +197,7 @@ def _before_acting(
     policy: Any = model.policy
     features, prediction = None, None
     if isinstance(policy, BeliefPolicyMixin) and policy.has_belief:
-        features = policy.flat_observations(policy.obs_to_tensor(seen)[0]).cpu().numpy()[0]  # type: ignore[attr-defined]
+        features = policy.flat_observations(policy.obs_to_tensor(seen)[0]).cpu().numpy()[0]
         if policy.options.variant is not None and policy.options.variant.predicts:
             batch = policy.predict_others(seen)
             expected = {name: rows[0] for name, rows in batch.actions.items()}

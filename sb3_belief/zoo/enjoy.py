@@ -13,8 +13,8 @@ from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import Outcome
 from sb3_belief.zoo.preflight import check_device, check_output
 from sb3_belief.zoo.replay import (
-    ShownTeam,
     ShownEnvironment,
+    ShownTeam,
     environment_of,
     render_modes_of,
     team_in_its_environment,

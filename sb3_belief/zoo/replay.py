@@ -75,15 +75,13 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     run = run_of(path)
     if run is None:
         raise ConfigError(
-            f"{command}: {str(path)!r} is not in the folder of a run (no {CONFIG} and {RECORD}), so its environment is unknown:"
-            " name it with --env, and its arguments with --env-kwargs."
+            f"{command}: {str(path)!r} is not in the folder of a run (no {CONFIG} and {RECORD}), so its environment is"
+            " unknown: name it with --env, and its arguments with --env-kwargs."
         )
     algo, env_id, conf_file = run
     check_record(run, packages, trust=saved.trust)
     folder = None if saved.trust else conf_file.parent
-    config = load_config(
-        algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder
-    )
+    config = load_config(algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder)
     return ShownEnvironment(config.env_id, config.env_kwargs, config.wrapper)
 
 

@@ -8,7 +8,7 @@ from sb3_belief.report.frames import NoPictureError
 from sb3_belief.report.recording import Recording, record_episodes
 from sb3_belief.report.viewer.page import write_viewer
 from sb3_belief.team import Team, TeamVecEnv
-from sb3_belief.zoo.errors import ConfigError, suggestion
+from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.preflight import check_device, check_output
 from sb3_belief.zoo.replay import ShownTeam, environment_of, render_modes_of, team_in_its_environment, with_mode
 from sb3_belief.zoo.run_folder import RECORD, find_team
@@ -62,9 +62,7 @@ def watch(options: WatchOptions) -> Path:
     with team_in_its_environment(path, with_mode(shown, "rgb_array"), options, options.seed, "watch") as (team, env):
         agents = list(team.agents)
         if options.agent is not None and options.agent not in agents:
-            raise ConfigError(
-                f"--agent: there is no agent {options.agent!r}.{suggestion(options.agent, agents)} Allowed: {', '.join(agents)}."
-            )
+            raise unknown_setting("--agent", "agent", options.agent, agents)
         recording = _recorded(team, env, options)
     manner = "greedy" if options.deterministic else "sampled"
     steps = "one timestep" if team.num_timesteps == 1 else f"{team.num_timesteps:,} joint steps"

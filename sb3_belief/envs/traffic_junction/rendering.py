@@ -245,7 +245,7 @@ def positions_in_picture(core: TrafficCore, copy: int, names: Sequence[str]) -> 
     found = {}
     for slot in np.flatnonzero(core.on_road[copy]):
         row, column = divmod(int(core.layout.cell[core.place[copy, slot]]), size)
-        found[names[slot]] = (column + 0.5) / size, (HUD_HEIGHT + (row + 0.5) * WIDTH / size) / height
+        found[names[int(slot)]] = (column + 0.5) / size, (HUD_HEIGHT + (row + 0.5) * WIDTH / size) / height
     return found
 
 

@@ -24,7 +24,9 @@ def viewer_page(recording: Recording, title: str, subtitle: str = "", agent: str
     files = resources.files("sb3_belief.report.viewer")
     parts = {name: (files / name).read_text(encoding="utf-8") for name in ("viewer.html", "viewer.css", "viewer.js")}
     # NaN is no JSON; JavaScript reads null for it. "<" could end the script
-    data = json.dumps(page_data(recording, title, subtitle, agent), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps(page_data(recording, title, subtitle, agent), separators=(",", ":"), allow_nan=False).replace(
+        "<", "\\u003c"
+    )
     page = parts["viewer.html"]
     for mark, text in (
         ("{{title}}", html.escape(title)),
@@ -37,7 +39,9 @@ def viewer_page(recording: Recording, title: str, subtitle: str = "", agent: str
     return page
 
 
-def write_viewer(recording: Recording, path: str | os.PathLike[str], title: str, subtitle: str = "", agent: str | None = None) -> Path:
+def write_viewer(
+    recording: Recording, path: str | os.PathLike[str], title: str, subtitle: str = "", agent: str | None = None
+) -> Path:
     """
     Write the viewer's page. An existing file is replaced only when the new one is complete.
 

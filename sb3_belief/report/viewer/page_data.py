@@ -99,7 +99,9 @@ def _view(agent: AgentMoment, moment: Moment, others: Sequence[str], encodings: 
         view["expects"] = [_rounded(expected[other]) for other in others]
         # The most likely action of each part, and how far a mean is off
         judged = [judge(expected[other], moment.actions[other], encodings[other]) for other in others]
-        view["right"] = [right if seen and agent.active else None for (right, _), seen in zip(judged, agent.visible, strict=True)]
+        view["right"] = [
+            right if seen and agent.active else None for (right, _), seen in zip(judged, agent.visible, strict=True)
+        ]
         view["error"] = [None if error is None else _number(error) for _, error in judged]
         rows = sorted(zip(agent.prediction.weights.tolist(), agent.prediction.rows.tolist(), strict=True), reverse=True)
         view["rows"] = [[row, round(weight, 5)] for weight, row in rows]
@@ -132,7 +134,8 @@ def _agent(agent: str, recording: Recording, encodings: dict[str, ActionEncoding
     others = recording.others_of(agent)
     policy: Any = model.policy
     described = {"algorithm": type(model).__name__, "others": others}
-    moments = [moment.agents[agent] for episode in recording.episodes for moment in episode.moments]
+    joint = [moment for episode in recording.episodes for moment in episode.moments]
+    moments = [moment.agents[agent] for moment in joint]
     predictions = [moment.prediction for moment in moments if moment.prediction is not None]
     if not predictions:
         return described
@@ -147,8 +150,9 @@ def _agent(agent: str, recording: Recording, encodings: dict[str, ActionEncoding
     remembered = history.observations.cpu().numpy()[shown]
     now = np.array([moment.features for moment in moments])
     strips, current = _strips(remembered, now)
-    alike = _alike(remembered, now)
     actions = history.actions.cpu().numpy()
+    acts = np.array([_seen_actions(moment, agent, others, encodings) for moment in joint])
+    alike = _alike(remembered, now, actions[shown], acts)
     return {
         **described,
         "history": filled,
@@ -185,16 +189,40 @@ def _strips(remembered: np.ndarray, now: np.ndarray) -> tuple[list[str], list[st
     return texts[: len(remembered)], texts[len(remembered) :]
 
 
-def _alike(remembered: np.ndarray, now: np.ndarray) -> list[list[Any]]:
-    """Return for each remembered observation the most similar one of the recording, by its number, and whether it is equal."""
+def _alike(remembered: np.ndarray, now: np.ndarray, acted: np.ndarray, acts: np.ndarray) -> list[list[Any]]:
+    """
+    Find the step of the recording at which an agent's observation was most like a remembered one.
+
+    :param remembered: Observations in the history, ``[N, d_o]``
+    :param now: Those of the recording, ``[K, d_o]``
+    :param acted: What it saw the others do at the remembered steps, ``[N, W]``
+    :param acts: The same of the recording, ``[K, W]``
+    :return: For each remembered step the number of the step, and whether observation and actions were the same
+    """
     low, high = now.min(axis=0), now.max(axis=0)
     scale = np.where(high > low, high - low, 1.0)
     found = []
-    for row in remembered:
-        distances = np.abs((now - row) / scale).mean(axis=1)
+    for row, others in zip(remembered, acted, strict=True):
+        same_actions = np.isclose(acts, others, atol=1e-6).all(axis=1)
+        # Of equal observations, those at which the others did the same
+        distances = np.abs((now - row) / scale).mean(axis=1) + 1e-9 * ~same_actions
         nearest = int(distances.argmin())
-        found.append([nearest, bool(np.allclose(now[nearest], row, atol=1e-6))])
+        found.append([nearest, bool(same_actions[nearest] and np.allclose(now[nearest], row, atol=1e-6))])
     return found
+
+
+def _seen_actions(moment: Moment, agent: str, others: Sequence[str], encodings: dict[str, ActionEncoding]) -> np.ndarray:
+    """Return what an agent saw the others do, as the rows of a history hold it, ``[W]``."""
+    parts = []
+    for other, seen in zip(others, moment.agents[agent].visible, strict=True):
+        encoding, action = encodings[other], moment.actions[other]
+        part = np.zeros(encoding.width)
+        if encoding.kind == "categorical":
+            part[action.astype(int) + np.concatenate([[0], np.cumsum(encoding.widths)[:-1]]).astype(int)] = 1.0
+        else:
+            part[:] = action
+        parts.append(part * seen)
+    return np.concatenate(parts)
 
 
 def _number(value: float) -> float:
@@ -205,5 +233,3 @@ def _rounded(values: Any) -> list[float]:
     # Shorter than JSON's 17 digits, and whole numbers without a point
     numbers = [float(f"{float(value):.4g}") for value in np.asarray(values).reshape(-1)]
     return [int(number) if number.is_integer() else number for number in numbers]
-
-

@@ -15,10 +15,11 @@ function make(tag, properties = {}, ...children) {
   element.append(...children.filter((child) => child));
   return element;
 }
-const percent = (share) => `${Math.round(100 * share)} %`;
-const short = (number) => String(Number(Number(number).toPrecision(3)));
+const percent = (share) => `${Math.round(100 * share)}\u00a0%`;
+const short = (number) => String(Number(Number(number).toPrecision(3))).replace("-", "\u2212");
 const all = (flags) => flags.every(Boolean);
 const names = Object.keys(D.agents);
+// The first step of each episode, counted over all of them
 const offsets = D.episodes.map((_, e) => D.episodes.slice(0, e).reduce((sum, episode) => sum + episode.steps.length, 0));
 const images = D.frames.map((url) => { const image = new Image(); image.src = url; return image; });
 const now = { episode: 0, step: 0, agent: names[0] };
@@ -33,7 +34,6 @@ const WORDS = { 1: ["right", "✓ right"], 0: ["wrong", "✗ wrong"] };
 
 // Bars
 
-/** Label of an action, such as "gas" or "2 / left". */
 function label(name, action) {
   const space = D.spaces[name];
   if (space.kind === "number") return action.map(short).join(", ");
@@ -95,12 +95,13 @@ function drawFrame() {
   const step = steps()[now.step];
   const image = $("frame");
   image.src = D.frames[step.frame];
-  image.alt = `The environment at step ${now.step + 1}`;
+  image.alt = `The environment at step ${now.step}`;
   const svg = $("overlay");
   svg.replaceChildren();
   const shown = images[step.frame];
   if (!shown.naturalWidth) { shown.addEventListener("load", draw, { once: true }); return; }
   const height = (100 * shown.naturalHeight) / shown.naturalWidth;
+  $("figure").style.setProperty("--ratio", 100 / height);
   svg.setAttribute("viewBox", `0 0 100 ${height}`);
   const at = (name) => step.at[name] && [100 * step.at[name][0], height * step.at[name][1]];
   const me = at(now.agent), seen = view(), r = radius(height);
@@ -109,7 +110,10 @@ function drawFrame() {
     const place = at(other);
     if (!place || !me || !seen.sees[k] || !seen.active) return;
     const how = verdict(seen, k), kind = how === null ? "none" : WORDS[how][0];
-    svg.append(make("svg:line", { x1: me[0], y1: me[1], x2: place[0], y2: place[1], class: "sight" }));
+    // From ring to ring, where there is room between them
+    const apart = Math.hypot(place[0] - me[0], place[1] - me[1]), along = (d) => [0, 1].map((i) => me[i] + ((place[i] - me[i]) * d) / apart);
+    const [[x1, y1], [x2, y2]] = [along(1.2 * r), along(apart - r)];
+    if (apart > 2.4 * r) svg.append(...["sight under", "sight"].map((kind) => make("svg:line", { x1, y1, x2, y2, class: kind })));
     svg.append(circle(place, r, "ring under"), circle(place, r, `ring line-${kind}`));
     if (how !== null) {
       const corner = [Math.min(place[0] + 0.75 * r, 97), Math.max(place[1] - 0.75 * r, 3)];
@@ -121,6 +125,13 @@ function drawFrame() {
   for (const name of names) {
     const place = at(name);
     if (!place) continue;
+    const k = agent().others.indexOf(name);
+    if (names.length <= 6 || k < 0 || seen.sees[k]) {
+      // Below it or above, where it is farther from the others
+      const room = (y) => Math.min(y - 1.5, height - 1.5 - y, ...Object.keys(step.at).filter((other) => other !== name).map((other) => Math.hypot(at(other)[0] - place[0], at(other)[1] - y)));
+      const y = [place[1] + r + 2.4, place[1] - r - 2.4].sort((a, b) => room(b) - room(a))[0];
+      svg.append(make("svg:text", { x: Math.max(5, Math.min(95, place[0])), y, class: `name${k < 0 ? " me" : ""}`, text: name }));
+    }
     const target = circle(place, r * 1.2, "who");
     target.append(make("svg:title", { text: name }));
     target.addEventListener("click", () => choose(name));
@@ -152,9 +163,8 @@ function buildTimeline() {
   const track = (name, title, cells) => make("div", { class: "track", "data-name": name, title },
     make("span", { text: name }), make("svg:svg", { viewBox: `0 0 ${n} 1`, preserveAspectRatio: "none", "aria-hidden": "true" }, ...cells));
   const cell = (t, height, kind, y = 1 - height) => make("svg:rect", { x: t + 0.06, y, width: 0.88, height, class: kind });
-  const rewards = steps().map((step) => step.reward);
-  const low = Math.min(0, ...rewards), size = Math.max(0, ...rewards) - low || 1;
-  const zero = 1 + low / size;
+  const rewards = steps().map((step) => step.reward), low = Math.min(0, ...rewards);
+  const size = Math.max(0, ...rewards) - low || 1, zero = 1 + low / size;
   const tracks = [track("reward", "The team's reward at each step", rewards.map((reward, t) =>
     cell(t, Math.max(Math.abs(reward) / size, 0.03), "amount", reward > 0 ? zero - reward / size : Math.min(zero, 0.97))))];
   if (agent().belief) {
@@ -174,6 +184,7 @@ function buildTimeline() {
     });
   }
   box.className = tracks.length > 9 ? "many" : "";
+  $("figure").style.setProperty("--tracks", tracks.length * (tracks.length > 9 ? 0.7 : 1));
   box.replaceChildren(...tracks, make("div", { id: "head" }));
   box.setAttribute("aria-valuemax", n - 1);
 }
@@ -184,7 +195,7 @@ function placeHead() {
   head.style.left = `${left + (width * now.step) / steps().length - 2}px`;
   head.style.width = `${width / steps().length + 4}px`;
   $("timeline").setAttribute("aria-valuenow", now.step);
-  $("timeline").setAttribute("aria-valuetext", `step ${now.step + 1} of ${steps().length}`);
+  $("timeline").setAttribute("aria-valuetext", `step ${now.step} of ${steps().length}`);
 }
 
 function stepAt(event) {
@@ -196,7 +207,7 @@ function stepAt(event) {
 
 function drawAgents() {
   const step = steps()[now.step];
-  const focused = document.activeElement && document.activeElement.dataset.agent;
+  const focused = document.activeElement?.dataset.agent;
   $("agents").replaceChildren(...names.map((name) => make("button", {
     type: "button", role: "radio", "aria-checked": String(name === now.agent), "data-agent": name, text: name,
     class: step.views[name].active ? "" : "idle", title: `${name} (${D.agents[name].algorithm})${step.views[name].active ? "" : ", not in play"}`,
@@ -219,13 +230,13 @@ function drawOwn() {
 function drawOthers() {
   const seen = view(), step = steps()[now.step], believes = Boolean(agent().belief);
   $("others-title").textContent = believes ? `What ${now.agent} believes that the others will do` : `What the others do`;
-  const folded = [];
+  const folded = [], absent = [];
   const cards = agent().others.map((other, k) => {
     const sees = seen.sees[k] && seen.active, how = believes ? verdict(seen, k) : null;
+    if (!sees && step.views[other] && !step.views[other].active) { absent.push(other); return null; }
     if (!sees && agent().others.length > MANY) { folded.push(other); return null; }
     const word = !sees ? "not seen" : how === null ? "seen" : WORDS[how][1];
-    const kind = how === null ? "" : WORDS[how][0];
-    const did = `${sees ? "did" : "does, unseen:"} ${label(other, step.did[other])}`;
+    const kind = how === null ? "" : WORDS[how][0], did = `${sees ? "did" : "does, unseen:"} ${label(other, step.did[other])}`;
     const error = believes && seen.error[k] !== null ? `, off by ${short(seen.error[k])}` : "";
     return make("article", { class: `card ${kind}${sees ? "" : " dim"}`, "data-other": other, "aria-label": `${other}: ${word}` },
       make("h3", {}, make("span", { text: other }), make("span", { class: `tag ${kind}`, text: word })),
@@ -233,7 +244,8 @@ function drawOthers() {
       make("div", { class: "quiet", text: `◆ ${did}${error}` }));
   }).filter(Boolean);
   $("others").replaceChildren(...cards);
-  $("unseen").textContent = folded.length ? `Not seen: ${folded.join(", ")}` : "";
+  const lists = [["Not seen", folded], ["Not in play", absent]].filter(([, others]) => others.length);
+  $("unseen").textContent = lists.map(([what, others]) => `${what}: ${others.join(", ")}`).join(" · ");
 }
 
 function drawScore() {
@@ -264,11 +276,10 @@ function drawScore() {
 function drawMemory() {
   const seen = view(), cards = agent().cards;
   $("memory-panel").hidden = !agent().belief;
-  const rows = cards ? seen.rows : [];
+  const rows = cards ? seen.rows : [], most = rows.length ? rows[0][1] : 1;
   $("memory-note").textContent = cards
     ? `${rows.length} of the last ${agent().history} steps in which it was in play, the newest on the right; the higher, the more weight.`
     : "This belief has no history, or an empty one: it follows from the observation alone.";
-  const most = rows.length ? rows[0][1] : 1;
   $("rows").replaceChildren(...(cards ? [make("svg:svg", { viewBox: `0 0 ${agent().history} 1`, preserveAspectRatio: "none", role: "img", "aria-label": `Weights of ${rows.length} history rows` },
     ...rows.map(([row, weight]) => make("svg:rect", { x: row, width: Math.max(agent().history / 250, 1), y: 1 - weight / most, height: weight / most })))] : []));
   const shown = rows.filter(([row]) => cards[row]).slice(0, 6);
@@ -281,16 +292,16 @@ function memoryCard(row, weight, card, share) {
   const [like, same] = card.like;
   const episode = offsets.findLastIndex((start) => start <= like), step = like - offsets[episode];
   const chips = agent().others.map((other, k) => card.did[k] && make("span", { class: "chip", text: `${other}: ${label(other, card.did[k])}` })).filter(Boolean);
-  const place = `step ${step + 1}${D.episodes.length > 1 ? ` of episode ${episode + 1}` : ""}`;
+  const place = `step ${step}${D.episodes.length > 1 ? ` of episode ${episode + 1}` : ""}`;
   const canvas = make("canvas", { width: 96, height: 2, role: "img", "aria-label": "Observation now (above) and then (below)", title: "Its observation now (above) and then (below)" });
   drawStrip(canvas, agent().now[offsets[now.episode] + now.step], card.seen);
   return make("article", { class: "card", "data-row": row },
     make("h3", {}, make("span", { text: `${card.age} ${card.age === 1 ? "step" : "steps"} back` }), make("span", { class: "tag", text: `${(100 * weight).toFixed(1)} %` })),
     make("div", { class: "weight" }, make("b", { style: `width:${100 * share}%` })),
     make("div", { class: "chips" }, ...(chips.length ? chips : [make("span", { class: "quiet", text: "it saw nobody act" })])),
-    canvas,
+    make("div", { class: "strip" }, make("span", { text: "now" }), canvas, make("span", { text: "then" })),
     make("button", { type: "button", class: "jump", onclick: () => go(step, episode), text: "" },
-      `${same ? "observed the same as at" : "most like"} ${place}`,
+      same ? `same observation and actions as at ${place}` : `observation most like ${place}`,
       same ? make("img", { src: D.frames[D.episodes[episode].steps[step].frame], alt: `The environment at ${place}` }) : null));
 }
 
@@ -308,7 +319,7 @@ function draw() {
   const step = steps()[now.step];
   drawFrame();
   drawAgents();
-  $("step").textContent = `step ${now.step + 1} of ${steps().length}`;
+  $("step").textContent = `step ${now.step} of ${steps().length}`;
   $("status").textContent = view().active ? "" : `${now.agent} is not in play at this step.`;
   for (const id of ["own-panel", "others-panel"]) $(id).style.opacity = view().active ? 1 : 0.5;
   document.querySelectorAll(".track").forEach((track) => {
@@ -316,7 +327,7 @@ function draw() {
     track.classList.toggle("seen", k >= 0 && step.views[now.agent].sees[k] && step.views[now.agent].active);
   });
   drawOwn(); drawOthers(); drawScore(); drawMemory(); placeHead();
-  try { history.replaceState(null, "", `#episode=${now.episode + 1}&step=${now.step + 1}&agent=${encodeURIComponent(now.agent)}`); } catch { /* not everywhere */ }
+  try { history.replaceState(null, "", `#episode=${now.episode + 1}&step=${now.step}&agent=${encodeURIComponent(now.agent)}`); } catch { /* not everywhere */ }
 }
 
 // What the user does
@@ -336,7 +347,7 @@ function play() {
   showPlaying();
 }
 function showPlaying() {
-  $("play").textContent = timer ? "⏸\uFE0E" : "▶\uFE0E";
+  $("play").querySelector("path").setAttribute("d", timer ? "M4 3h4v14H4zM12 3h4v14h-4z" : "M5 3l12 7-12 7z");
   $("play").setAttribute("aria-label", timer ? "Pause" : "Play");
 }
 function setTheme(theme) {
@@ -344,8 +355,7 @@ function setTheme(theme) {
   $("theme").textContent = theme === "dark" ? "☀\uFE0E light" : "☾\uFE0E dark";
 }
 function drawOutcome() {
-  const episode = D.episodes[now.episode];
-  const success = episode.success === null ? null : make("span", { class: `tag ${episode.success ? "right" : "wrong"}`, text: episode.success ? "✓ success" : "✗ no success" });
+  const episode = D.episodes[now.episode], success = episode.success === null ? null : make("span", { class: `tag ${episode.success ? "right" : "wrong"}`, text: episode.success ? "✓ success" : "✗ no success" });
   $("outcome").replaceChildren(...[make("span", { class: "tag", text: `return ${short(episode.return)}` }), make("span", { class: "tag", text: `${steps().length} steps` }), success].filter(Boolean));
 }
 
@@ -356,19 +366,17 @@ function bestStep(name) {
 }
 
 function start() {
-  $("title").textContent = D.title;
-  $("subtitle").textContent = D.subtitle;
+  for (const id of ["title", "subtitle"]) $(id).textContent = D[id];
   $("episode").append(...D.episodes.map((_, e) => make("option", { value: e, text: `episode ${e + 1}` })));
   $("episode").hidden = D.episodes.length < 2;
   const asked = new URLSearchParams(location.hash.slice(1));
   now.episode = Math.max(0, Math.min(D.episodes.length - 1, Number(asked.get("episode") || 1) - 1));
   now.agent = D.agents[asked.get("agent")] ? asked.get("agent") : D.agent;
-  now.step = asked.get("step") ? Math.max(0, Math.min(steps().length - 1, Number(asked.get("step")) - 1)) : bestStep(now.agent);
+  now.step = asked.get("step") ? Math.max(0, Math.min(steps().length - 1, Number(asked.get("step")))) : bestStep(now.agent);
   $("episode").value = now.episode;
-  $("legend").replaceChildren(make("b", { class: "r", text: "✓ low" }), " the most likely action is what it did  ", make("b", { class: "w", text: "✗ high" }), " it did something else  – not seen");
+  $("legend").replaceChildren(make("b", { class: "r", text: "✓ low" }), ": it did what was most likely. ", make("b", { class: "w", text: "✗ high" }), ": it did something else. Empty: not seen.");
   $("first").onclick = () => go(0);
-  $("back").onclick = () => go(now.step - 1);
-  $("forward").onclick = () => go(now.step + 1);
+  $("back").onclick = () => go(now.step - 1); $("forward").onclick = () => go(now.step + 1);
   $("last").onclick = () => go(steps().length - 1);
   $("play").onclick = () => (timer ? pause() : play());
   $("speed").onchange = () => { if (timer) { clearInterval(timer); play(); } };
