@@ -82,7 +82,9 @@ class EveryKind(ParallelEnv):
         return np.full((4, 6, 3), 40 * (self.t // 2), np.uint8) if self.picture else "no picture"
 
 
-SMALL: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, policy_kwargs={"net_arch": [8], "embedding_dim": 8, "latent_dim": 4})
+SMALL: dict[str, Any] = dict(
+    n_steps=16, batch_size=16, n_epochs=1, policy_kwargs={"net_arch": [8], "embedding_dim": 8, "latent_dim": 4}
+)
 
 
 def trained(

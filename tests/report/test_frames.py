@@ -64,7 +64,9 @@ def test_what_is_rendered_becomes_a_frame_with_whole_factors():
     assert frame_of(Rendering(large)).shape == (700, 300, 3)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("result", "message"), [(None, "NoneType"), ("text", r"shape \(\)"), (np.zeros((4, 6)), r"shape \(4, 6\)")])
+@pytest.mark.parametrize(
+    ("result", "message"), [(None, "NoneType"), ("text", r"shape \(\)"), (np.zeros((4, 6)), r"shape \(4, 6\)")]
+)
 def test_what_is_no_picture_is_refused(result, message):
     with pytest.raises(NoPictureError, match=message):
         frame_of(Rendering(result))  # type: ignore[arg-type]

@@ -27,7 +27,8 @@ def moments(recording):
 
 def copied(team):
     return {
-        agent: {name: value.clone() for name, value in model.policy.state_dict().items()} for agent, model in team.agents.items()
+        agent: {name: value.clone() for name, value in model.policy.state_dict().items()}
+        for agent, model in team.agents.items()
     }
 
 
@@ -63,7 +64,9 @@ def test_predictions_are_those_of_predict_others_on_the_observations(team_and_en
             expected = model.policy.predict_others(observed)
             found = moment.agents[agent]
             np.testing.assert_array_equal(found.observation, observed)
-            assert list(found.prediction.actions) == recording.others_of(agent) == [*(n for n in SPACES if n != agent), "clock"]
+            assert (
+                list(found.prediction.actions) == recording.others_of(agent) == [*(n for n in SPACES if n != agent), "clock"]
+            )
             for other in expected.actions:
                 np.testing.assert_array_equal(found.prediction.actions[other], expected.actions[other][0])
             np.testing.assert_array_equal(found.prediction.rows, expected.rows[0])

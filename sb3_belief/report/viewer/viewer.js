@@ -92,13 +92,11 @@ function numberBars(space, numbers, did) {
 // The picture
 
 function drawFrame() {
-  const step = steps()[now.step];
-  const image = $("frame");
+  const step = steps()[now.step], image = $("frame");
   image.src = D.frames[step.frame];
   image.alt = `The environment at step ${now.step}`;
-  const svg = $("overlay");
+  const svg = $("overlay"), shown = images[step.frame];
   svg.replaceChildren();
-  const shown = images[step.frame];
   if (!shown.naturalWidth) { shown.addEventListener("load", draw, { once: true }); return; }
   const height = (100 * shown.naturalHeight) / shown.naturalWidth;
   $("figure").style.setProperty("--ratio", 100 / height);
@@ -370,14 +368,14 @@ function start() {
   $("episode").append(...D.episodes.map((_, e) => make("option", { value: e, text: `episode ${e + 1}` })));
   $("episode").hidden = D.episodes.length < 2;
   const asked = new URLSearchParams(location.hash.slice(1));
-  now.episode = Math.max(0, Math.min(D.episodes.length - 1, Number(asked.get("episode") || 1) - 1));
-  now.agent = D.agents[asked.get("agent")] ? asked.get("agent") : D.agent;
-  now.step = asked.get("step") ? Math.max(0, Math.min(steps().length - 1, Number(asked.get("step")))) : bestStep(now.agent);
+  const number = (name, most) => Math.max(0, Math.min(most, Math.trunc(Number(asked.get(name))) || 0));
+  now.episode = Math.max(number("episode", D.episodes.length), 1) - 1;
+  now.agent = names.includes(asked.get("agent")) ? asked.get("agent") : D.agent;
+  now.step = asked.has("step") ? number("step", steps().length - 1) : bestStep(now.agent);
   $("episode").value = now.episode;
   $("legend").replaceChildren(make("b", { class: "r", text: "✓ low" }), ": it did what was most likely. ", make("b", { class: "w", text: "✗ high" }), ": it did something else. Empty: not seen.");
-  $("first").onclick = () => go(0);
+  $("first").onclick = () => go(0); $("last").onclick = () => go(steps().length - 1);
   $("back").onclick = () => go(now.step - 1); $("forward").onclick = () => go(now.step + 1);
-  $("last").onclick = () => go(steps().length - 1);
   $("play").onclick = () => (timer ? pause() : play());
   $("speed").onchange = () => { if (timer) { clearInterval(timer); play(); } };
   $("episode").onchange = (event) => { pause(); go(0, Number(event.target.value)); };
