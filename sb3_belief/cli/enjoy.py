@@ -26,7 +26,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily (default)"
     )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment and of sampled actions")
     parser.add_argument("--output", type=new_path, help=".gif or .mp4 file to write; if left out, a window is opened")
     parser.add_argument(
         "--fps", type=frame_rate, help="frames per second of the file; if left out, the environment's own rate"

@@ -21,7 +21,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--agent", type=filled_text, help="agent to show at first; if left out, the one that sees others most")
     parser.add_argument("--episodes", type=positive_number, default=1, help="number of episodes to record")
     parser.add_argument("--stochastic", action="store_true", help="sample the actions instead of acting greedily")
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment and of sampled actions")
     parser.add_argument(
         "--output", type=new_path, help="HTML file to write; if left out, viewer.html in the run's folder, or beside the zip"
     )

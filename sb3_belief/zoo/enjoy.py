@@ -33,7 +33,7 @@ class EnjoyOptions(ShownTeam):
     :param episodes: Number of episodes to play
     :param n_timesteps: Number of steps to play instead, or None
     :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
-    :param seed: Seed of the environment
+    :param seed: Seed of the environment, and of what the agents sample
     :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
     :param fps: Frames per second of the file, or None for the environment's own rate
     """

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.utils import set_random_seed
+
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
@@ -126,7 +128,7 @@ def team_in_its_environment(
     :param path: Zip of the team
     :param shown: The environment
     :param saved: The options
-    :param seed: Seed of the environment
+    :param seed: Seed of the environment, and of what the agents sample
     :param command: Name of the command, for error messages
     :return: The team and the environment, seeded and not reset yet
     :raises ConfigError: If the environment refuses its settings, or the team cannot be loaded
@@ -142,6 +144,8 @@ def team_in_its_environment(
             raise ConfigError(f"{command}: {str(path)!r} cannot be loaded: {cause(error)}") from error
         # This comes after loading, which seeds the environment as in the training
         env.seed(seed)
+        # What the agents sample, and what an environment draws from the global generators, is then the same again
+        set_random_seed(seed)
         yield team, env
     finally:
         env.close()

@@ -26,7 +26,7 @@ class WatchOptions(ShownTeam):
 
     :param episodes: Number of episodes to record
     :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
-    :param seed: Seed of the environment
+    :param seed: Seed of the environment, and of what the agents sample
     :param agent: Name of the agent that the page shows at first. None for the first one that has a belief
     :param output: Path of the page, or None for ``viewer.html`` in the run's folder, or beside the zip
     :param opens: Whether to open the page in the browser
