@@ -1,5 +1,8 @@
 """Where agents are in the picture, by the pixels there."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -82,3 +85,18 @@ def test_particles_are_where_they_are_drawn(n_steps):
     assert env.get_attr("action_names")[0]["agent_0"] == ["nothing", "left", "right", "down", "up"]
     speaking = make_team_env("mpe/simple_speaker_listener_v4", n_envs=1)
     assert list(speaking.get_attr("action_names")[0]) == ["listener_0"]
+
+
+@pytest.mark.parametrize("map_size", [(32.0, 32.0), (32.0, 16.0), (10.0, 20.0)])
+def test_units_are_where_they_are_drawn(map_size):
+    pytest.importorskip("matplotlib")
+    from sb3_belief.envs.adapters.smax.rendering import draw, unit_positions
+
+    places = np.array([[0.3, 0.6], [0.8, 0.2], [0.5, 0.5]]) * map_size
+    units = {"positions": places, "types": np.zeros(3, int), "health": np.ones(3), "alive": np.array([True, False, True])}
+    drawing = SimpleNamespace(map_size=map_size, radii=[1.5], full_health=[1.0], letters=[""])
+    battles: Any = SimpleNamespace(agents=["ally_0", "ally_1"], drawing=drawing, units=lambda copy: units)
+    image, positions = draw(battles, 0), unit_positions(battles, 0)
+    assert list(positions) == ["ally_0"]
+    blue = (near(image, positions["ally_0"], reach=6)[:, 2] > 150) & (near(image, positions["ally_0"], reach=6)[:, 0] < 80)
+    assert blue.mean() > 0.9

@@ -65,6 +65,12 @@ class StarCraft(BattleGame[np.ndarray]):
         self._masks = np.ones((n_agents, self.n_actions), dtype=bool)
         self._visible = np.zeros((n_agents, n_agents - 1), dtype=bool)
 
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The names of the actions; those with a target heal it if the unit is a medic."""
+        moves = ("no-op", "stop", "north", "south", "east", "west")
+        return (*moves, *(f"target {k}" for k in range(self.n_actions - len(moves))))
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> ResetResult:
         """
         Start a battle.

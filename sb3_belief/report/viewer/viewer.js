@@ -126,9 +126,12 @@ function drawFrame() {
     const k = agent().others.indexOf(name);
     if (names.length <= 6 || k < 0 || seen.sees[k]) {
       // Below it or above, where it is farther from the others
-      const room = (y) => Math.min(y - 1.5, height - 1.5 - y, ...Object.keys(step.at).filter((other) => other !== name).map((other) => Math.hypot(at(other)[0] - place[0], at(other)[1] - y)));
+      const others = Object.keys(step.at).filter((other) => other !== name).map(at);
+      const room = (y) => Math.min(y - 1.5, height - 1.5 - y, ...others.map((other) => Math.hypot(other[0] - place[0], other[1] - y)));
       const y = [place[1] + r + 2.4, place[1] - r - 2.4].sort((a, b) => room(b) - room(a))[0];
-      svg.append(make("svg:text", { x: Math.max(5, Math.min(95, place[0])), y, class: `name${k < 0 ? " me" : ""}`, text: name }));
+      // Half of the text's width, nearly
+      const half = 0.9 * name.length + 1;
+      svg.append(make("svg:text", { x: Math.max(half, Math.min(100 - half, place[0])), y, class: `name${k < 0 ? " me" : ""}`, text: name }));
     }
     const target = circle(place, r * 1.2, "who");
     target.append(make("svg:title", { text: name }));
@@ -178,6 +181,7 @@ function buildTimeline() {
         else if (seen.active && seen.sees[k] && seen.error[k] !== null) cells.push(cell(t, Math.max(seen.error[k] / worst, 0.06), "amount"));
         else cells.push(cell(t, 0.07, "blank"));
       });
+      if (agent().others.length > MANY && !steps().some((_, t) => view(t).sees[k])) return;
       tracks.push(track(other, total ? `${other}: right at ${right} of ${total} steps` : other, cells));
     });
   }

@@ -55,6 +55,12 @@ class Battles:
         self.masks[:, :, self.stop] = True
         self._alive = np.ones((n_copies, n_agents), dtype=bool)
 
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The names of the actions: four directions, "stop", and one for each enemy."""
+        moves = ("up", "right", "down", "left", "stop")
+        return (*moves, *(f"attack {enemy}" for enemy in range(self.n_actions - len(moves))))
+
     def seed(self, copy: int, seed: int) -> None:
         """
         Seed the random generator of one copy. The seed takes effect at its next reset.

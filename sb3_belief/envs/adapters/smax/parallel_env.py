@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_belief.envs.adapters.smax.core import Battles
 from sb3_belief.envs.adapters.smax.program import BattleConfig
-from sb3_belief.envs.adapters.smax.rendering import draw
+from sb3_belief.envs.adapters.smax.rendering import draw, unit_positions
 from sb3_belief.envs.base import BattleGame, ResetResult, StepResult, check_render_mode, require_render_mode
 
 RENDER_MODES = ("rgb_array",)
@@ -130,6 +130,19 @@ class Smax(BattleGame[np.ndarray]):
         self.battles.set_states([state["battle"]])
         self._visible = np.array(state["visible"], dtype=bool)
         self.agents = list(self.possible_agents) if state["under_way"] else []
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The names of the actions of each agent."""
+        return self.battles.action_names
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the living agents are in the picture.
+
+        :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
+        """
+        return unit_positions(self.battles, 0)
 
     def render(self) -> np.ndarray | None:
         """

@@ -38,3 +38,20 @@ def draw(battles: Battles, copy: int) -> np.ndarray:
         axes.text(x, y, drawing.letters[kind], ha="center", va="center", fontsize=6)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+
+
+def unit_positions(battles: Battles, copy: int) -> dict[str, tuple[float, float]]:
+    """
+    Return where the living allies are in the picture of one copy.
+
+    :param battles: The copies
+    :param copy: Index of the copy
+    :return: {agent: (x, y)} as fractions of the picture's width and height, from the upper left corner
+    """
+    units, (width, height) = battles.units(copy), battles.drawing.map_size
+    side = max(width, height)
+    return {
+        agent: (0.5 + float(x - width / 2) / side, 0.5 - float(y - height / 2) / side)
+        for agent, (x, y), alive in zip(battles.agents, units["positions"], units["alive"], strict=False)
+        if alive
+    }

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from sb3_belief.envs.adapters.smax.core import Battles
 from sb3_belief.envs.adapters.smax.parallel_env import RENDER_MODES, observation_space
 from sb3_belief.envs.adapters.smax.program import BattleConfig
-from sb3_belief.envs.adapters.smax.rendering import draw
+from sb3_belief.envs.adapters.smax.rendering import draw, unit_positions
 from sb3_belief.envs.base import check_render_mode
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
@@ -132,6 +132,19 @@ class SmaxVecEnv(TeamVecEnv):
         self.battles.set_states(states)
         self._zero_episode_sums()
         return self._observe()
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The names of the actions of each agent."""
+        return self.battles.action_names
+
+    def picture_positions(self) -> dict[str, tuple[float, float]]:
+        """
+        Return where the living agents are in the picture of the first copy.
+
+        :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
+        """
+        return unit_positions(self.battles, 0)
 
     def get_images(self) -> list[np.ndarray | None]:
         """
