@@ -12,7 +12,9 @@ from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 # Least side of a frame in pixels, as far as whole factors allow it
 _SIDE = 480
 #: The most bytes that the frames of a page may have; more are made smaller
-FRAME_BYTES = 9_000_000
+FRAME_BYTES = 7_000_000
+# To which they are made smaller at the most
+_LEAST_SIDE = 60
 
 
 class NoPictureError(ValueError):
@@ -68,11 +70,11 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 class FrameStore:
-    """Frames of a page. Equal ones are stored once."""
+    """Frames of a page. Equal ones are stored once, and all are compressed: hundreds of pictures would fill the memory."""
 
     def __init__(self) -> None:
-        self._frames: list[np.ndarray] = []
-        self._indices: dict[bytes, int] = {}
+        # Number by shape and compressed pixels, in order
+        self._numbers: dict[tuple[tuple[int, ...], bytes], int] = {}
 
     def add(self, frame: np.ndarray) -> int:
         """
@@ -81,29 +83,34 @@ class FrameStore:
         :param frame: uint8 ``[height, width, 3]``
         :return: Its number
         """
-        key = repr(frame.shape).encode() + frame.tobytes()
-        # Compressed, so that the key of a picture is not as large as the picture
-        number = self._indices.setdefault(zlib.compress(key, 1), len(self._frames))
-        if number == len(self._frames):
-            self._frames.append(frame)
-        return number
+        return self._numbers.setdefault((frame.shape, zlib.compress(frame.tobytes(), 1)), len(self._numbers))
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._numbers)
 
     def urls(self, most_bytes: int = FRAME_BYTES) -> list[str]:
         """
         Return the frames as ``data:`` URLs.
 
-        :param most_bytes: The most that all PNG files together may have. Frames are halved until they do, down to 120 pixels
+        :param most_bytes: The most that all PNG files together may have. Frames are halved until they do, but not below 60
+            pixels
         :return: One URL for each frame, by its number
         """
-        frames = self._frames
-        files = [encode_png(frame) for frame in frames]
-        while sum(map(len, files)) > most_bytes and max(max(frame.shape[:2]) for frame in frames) > 240:
-            frames = [_halved(frame) for frame in frames]
-            files = [encode_png(frame) for frame in frames]
+        largest = max((max(shape[:2]) for shape, _ in self._numbers), default=0)
+        halvings, files = 0, self._files(0)
+        while sum(map(len, files)) > most_bytes and largest >> (halvings + 1) >= _LEAST_SIDE:
+            halvings += 1
+            files = self._files(halvings)
         return ["data:image/png;base64," + base64.b64encode(file).decode() for file in files]
+
+    def _files(self, halvings: int) -> list[bytes]:
+        files = []
+        for shape, pixels in self._numbers:
+            frame = np.frombuffer(zlib.decompress(pixels), dtype=np.uint8).reshape(shape)
+            for _ in range(halvings):
+                frame = _halved(frame)
+            files.append(encode_png(frame))
+        return files
 
 
 def _halved(frame: np.ndarray) -> np.ndarray:

@@ -22,7 +22,9 @@ def viewer_page(recording: Recording, title: str, subtitle: str = "", agent: str
     :return: HTML
     """
     files = resources.files("sb3_belief.report.viewer")
-    parts = {name: (files / name).read_text(encoding="utf-8") for name in ("viewer.html", "viewer.css", "viewer.js")}
+    parts = {
+        name: (files / name).read_text(encoding="utf-8") for name in ("viewer.html", "viewer.css", "bars.js", "viewer.js")
+    }
     # NaN is no JSON; JavaScript reads null for it. "<" could end the script
     data = json.dumps(page_data(recording, title, subtitle, agent), separators=(",", ":"), allow_nan=False).replace(
         "<", "\\u003c"
@@ -31,7 +33,7 @@ def viewer_page(recording: Recording, title: str, subtitle: str = "", agent: str
     for mark, text in (
         ("{{title}}", html.escape(title)),
         ("{{style}}", parts["viewer.css"]),
-        ("{{program}}", parts["viewer.js"]),
+        ("{{program}}", parts["bars.js"] + parts["viewer.js"]),
         # Last, so that no text of the recording is taken for a mark
         ("{{data}}", data),
     ):

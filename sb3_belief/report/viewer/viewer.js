@@ -1,24 +1,7 @@
-"use strict";
-const D = JSON.parse(document.getElementById("data").textContent);
-const $ = (id) => document.getElementById(id);
-const SVG = "http://www.w3.org/2000/svg";
 const MANY = 4; // more others than this: those that are not seen are folded
-
-/** Make an element. Texts are set as text, so that no name can be taken for HTML. */
-function make(tag, properties = {}, ...children) {
-  const element = tag.startsWith("svg:") ? document.createElementNS(SVG, tag.slice(4)) : document.createElement(tag);
-  for (const [name, value] of Object.entries(properties)) {
-    if (name === "text") element.textContent = value;
-    else if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
-    else if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value === true ? "" : value);
-  }
-  element.append(...children.filter((child) => child));
-  return element;
-}
-const percent = (share) => `${Math.round(100 * share)}\u00a0%`;
-const short = (number) => String(Number(Number(number).toPrecision(3))).replace("-", "\u2212");
 const all = (flags) => flags.every(Boolean);
-const names = Object.keys(D.agents);
+// Not the keys of an object, which are sorted where they are numbers
+const names = D.names.filter((name) => Object.hasOwn(D.agents, name));
 // The first step of each episode, counted over all of them
 const offsets = D.episodes.map((_, e) => D.episodes.slice(0, e).reduce((sum, episode) => sum + episode.steps.length, 0));
 const images = D.frames.map((url) => { const image = new Image(); image.src = url; return image; });
@@ -32,63 +15,6 @@ const agent = () => D.agents[now.agent];
 const verdict = (seen, k) => (seen.right && seen.right[k] ? (all(seen.right[k]) ? 1 : 0) : null);
 const WORDS = { 1: ["right", "✓ right"], 0: ["wrong", "✗ wrong"] };
 
-// Bars
-
-function label(name, action) {
-  const space = D.spaces[name];
-  if (space.kind === "number") return action.map(short).join(", ");
-  if (space.kind === "binary") return space.labels[0].filter((_, k) => action[k]).join(" + ") || "none";
-  return action.map((index, part) => space.labels[part][index]).join(" / ");
-}
-
-/** One group of bars for each part of an action space: how likely each action is, and which was done. */
-function bars(name, numbers, did, kind) {
-  const space = D.spaces[name];
-  if (space.kind === "number") return numberBars(space, numbers, did);
-  const box = make("div");
-  let start = 0;
-  space.labels.forEach((labels, part) => {
-    const values = numbers.slice(start, start + labels.length);
-    start += labels.length;
-    const low = kind === "values" ? Math.min(...values) : 0;
-    const size = kind === "values" ? Math.max(...values) - low || 1 : 1;
-    const most = values.indexOf(Math.max(...values));
-    const done = (k) => did && (space.kind === "binary" ? did[k] === 1 : did[part] === k);
-    const top = (k) => (space.kind === "binary" ? values[k] > 0.5 : k === most);
-    let shown = labels.map((_, k) => k);
-    if (shown.length > 8) shown = shown.sort((a, b) => values[b] - values[a]).filter((k, rank) => rank < 6 || done(k)).sort((a, b) => a - b);
-    if (space.labels.length > 1) box.append(make("div", { class: "part", text: `part ${part}` }));
-    const group = make("div", { class: "bars" });
-    for (const k of shown) {
-      const text = kind === "values" ? short(values[k]) : percent(values[k]);
-      const mark = done(k) ? "◆ " : "";
-      group.append(make("div", { class: `bar${top(k) ? " top" : ""}${done(k) ? " did" : ""}`, title: `${labels[k]}: ${text}${done(k) ? ", and so it did" : ""}` },
-        make("span", { text: mark + labels[k] }),
-        make("i", {}, make("b", { style: `width:${Math.max(0, Math.min(1, (values[k] - low) / size)) * 100}%` })),
-        make("span", { text })));
-    }
-    if (shown.length < labels.length) group.append(make("div", { class: "part", text: `and ${labels.length - shown.length} less likely actions` }));
-    box.append(group);
-  });
-  return box;
-}
-
-/** A scale for each number of a continuous action: the bar is what was done, the square what was expected. */
-function numberBars(space, numbers, did) {
-  const group = make("div", { class: "bars" });
-  space.low.slice(0, 8).forEach((low, k) => {
-    const values = [numbers[k], did && did[k]].filter((value) => value !== undefined && value !== null);
-    const least = Math.min(low, ...values), most = Math.max(space.high[k], ...values);
-    const at = (value) => `left:${(100 * (value - least)) / (most - least || 1)}%`;
-    const expected = numbers[k] === undefined ? null : make("s", { style: at(numbers[k]) });
-    group.append(make("div", { class: "bar", title: values.map(short).join(", did ") },
-      make("span", { text: `number ${k}` }),
-      make("i", {}, did ? make("u", { style: at(did[k]) }) : null, expected),
-      make("span", { text: short(values[0]) })));
-  });
-  return group;
-}
-
 // The picture
 
 function drawFrame() {
@@ -101,8 +27,8 @@ function drawFrame() {
   const height = (100 * shown.naturalHeight) / shown.naturalWidth;
   $("figure").style.setProperty("--ratio", 100 / height);
   svg.setAttribute("viewBox", `0 0 100 ${height}`);
-  const at = (name) => step.at[name] && [100 * step.at[name][0], height * step.at[name][1]];
-  const me = at(now.agent), seen = view(), r = radius(height);
+  const at = (name) => step.at[name] && [100 * step.at[name][0], height * step.at[name][1]], me = at(now.agent);
+  const seen = view(), r = radius(height);
   const circle = (place, size, kind) => make("svg:circle", { cx: place[0], cy: place[1], r: size, class: kind });
   agent().others.forEach((other, k) => {
     const place = at(other);
@@ -129,13 +55,11 @@ function drawFrame() {
       const others = Object.keys(step.at).filter((other) => other !== name).map(at);
       const room = (y) => Math.min(y - 1.5, height - 1.5 - y, ...others.map((other) => Math.hypot(other[0] - place[0], other[1] - y)));
       const y = [place[1] + r + 2.4, place[1] - r - 2.4].sort((a, b) => room(b) - room(a))[0];
-      // Half of the text's width, nearly
-      const half = 0.9 * name.length + 1;
+      const half = 0.9 * name.length + 1; // of the text's width, nearly
       svg.append(make("svg:text", { x: Math.max(half, Math.min(100 - half, place[0])), y, class: `name${k < 0 ? " me" : ""}`, text: name }));
     }
-    const target = circle(place, r * 1.2, "who");
+    const target = make("svg:circle", { cx: place[0], cy: place[1], r: r * 1.2, class: "who", onclick: () => choose(name) });
     target.append(make("svg:title", { text: name }));
-    target.addEventListener("click", () => choose(name));
     svg.append(target);
   }
 }
