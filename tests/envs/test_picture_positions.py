@@ -14,7 +14,7 @@ pytest.importorskip("pygame")
 
 
 def played(env_id, n_steps, **env_kwargs):
-    env = make_team_env(env_id, n_envs=1, seed=3, env_kwargs={"render_mode": "rgb_array", **env_kwargs})
+    env: Any = make_team_env(env_id, n_envs=1, seed=3, env_kwargs={"render_mode": "rgb_array", **env_kwargs})
     env.reset()
     rng = np.random.default_rng(0)
     for _ in range(n_steps):

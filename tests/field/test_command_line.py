@@ -118,8 +118,8 @@ def test_flags_and_sizes_that_are_refused(words, message, tmp_path, monkeypatch,
     "words",
     [
         *(["train", flag] for flag in ("--env", "--algo", "-f", "-tb", "-i", "-conf", "--device", "--allow-package")),
-        *(["enjoy", "x", flag] for flag in ("--env", "--output", "--device")),
-        *([command] for command in ("enjoy", "export")),
+        *([command, "x", flag] for command in ("enjoy", "watch") for flag in ("--env", "--output", "--device")),
+        *([command] for command in ("enjoy", "watch", "export")),
         *(["export", "x:y", "--output"], ["envs", "list"], ["envs", "check"], ["demo", "-f"]),
     ],
 )
@@ -128,7 +128,9 @@ def test_values_that_are_empty_are_refused(words, tmp_path, monkeypatch, capsys)
         assert "must not be empty" in refused([*words, empty], tmp_path, monkeypatch, capsys)
 
 
-@pytest.mark.parametrize("words", [["train", "-f"], ["train", "-tb"], ["enjoy", "x", "--output"], ["demo", "-f"]])
+@pytest.mark.parametrize(
+    "words", [["train", "-f"], ["train", "-tb"], ["enjoy", "x", "--output"], ["watch", "x", "--output"], ["demo", "-f"]]
+)
 def test_a_home_that_the_shell_has_not_replaced_is_refused(words, tmp_path, monkeypatch, capsys):
     for path in ("~nouser/x", "~/x.gif"):
         assert f"'{path}' begins with '~'" in refused([*words, path], tmp_path, monkeypatch, capsys)

@@ -231,7 +231,8 @@ def test_what_a_stranger_writes_beside_the_team_runs_nothing(run, tmp_path, monk
         "env_wrapper": {"stable_baselines3.common.monitor.Monitor": {"filename": "elsewhere"}},
         "visibility": "stable_baselines3.common.save_util.load_from_pkl",
     }
-    commands = [["enjoy", str(folder), "-n", "2"], ["train", "-i", str(folder), "-n", "4", "--eval-freq", "-1", "-f", "logs"]]
+    commands = [["enjoy", str(folder), "-n", "2"], ["watch", str(folder)]]
+    commands += [["train", "-i", str(folder), "-n", "4", "--eval-freq", "-1", "-f", "logs"]]
     for env in envs:
         for command in commands:
             shutil.rmtree(folder, ignore_errors=True)

@@ -25,7 +25,12 @@ def run(tmp_path_factory):
 @pytest.fixture
 def opened(monkeypatch):
     pages: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", lambda page: pages.append(page) or True)
+
+    def open_page(page):
+        pages.append(page)
+        return True
+
+    monkeypatch.setattr(webbrowser, "open", open_page)
     return pages
 
 
@@ -93,6 +98,7 @@ def test_without_a_browser_it_says_so(run, monkeypatch, capsys):
 def test_what_is_refused_is_refused_before_anything_is_written(words, message, run, opened, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (run / "viewer.html").unlink(missing_ok=True)
+    status: int | str | None
     try:
         status = main(["watch", str(run), *words])
     except SystemExit as error:

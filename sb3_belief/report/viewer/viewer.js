@@ -116,10 +116,8 @@ function buildTimeline() {
 }
 
 function placeHead() {
-  const lane = $("timeline").querySelector("svg"), head = $("head"), width = lane.clientWidth || lane.getBoundingClientRect().width;
-  const left = lane.getBoundingClientRect().left - $("timeline").getBoundingClientRect().left;
-  head.style.left = `${left + (width * now.step) / steps().length - 2}px`;
-  head.style.width = `${width / steps().length + 4}px`;
+  $("head").style.setProperty("--from", now.step / steps().length);
+  $("head").style.setProperty("--share", 1 / steps().length);
   $("timeline").setAttribute("aria-valuenow", now.step);
   $("timeline").setAttribute("aria-valuetext", `step ${now.step} of ${steps().length}`);
 }
@@ -310,7 +308,10 @@ function start() {
   $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   $("timeline").onpointerdown = (event) => { $("timeline").setPointerCapture(event.pointerId); go(stepAt(event)); };
   $("timeline").onpointermove = (event) => { if (event.buttons) go(stepAt(event)); };
-  window.addEventListener("resize", placeHead);
+  // Paper is light
+  let before = null;
+  window.addEventListener("beforeprint", () => { before = document.documentElement.dataset.theme; setTheme("light"); });
+  window.addEventListener("afterprint", () => setTheme(before));
   document.addEventListener("keydown", (event) => {
     if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
     const turn = (by) => choose(names[(names.indexOf(now.agent) + by + names.length) % names.length]);

@@ -170,6 +170,23 @@ def test_it_fits_a_phone(page):
         assert complaints(driver) == []
 
 
-def test_it_prints(driver):
+def test_the_head_stands_over_its_step(driver):
+    place = "const box = document.querySelector(arguments[0]).getBoundingClientRect(); return [box.left, box.right]"
+    for step in range(LIMIT):
+        left, right = driver.execute_script(place, "#head")
+        start, end = driver.execute_script(place, "#timeline svg")
+        width = (end - start) / LIMIT
+        assert (left, right) == pytest.approx((start + step * width - 2, start + (step + 1) * width + 2), abs=0.6)
+        key(driver, "ARROW_RIGHT")
+
+
+def test_it_prints_light(driver):
+    find(driver, "#theme")[0].click()
+    theme = driver.execute_script("return document.documentElement.dataset.theme")
     # A PDF in base64, of more than an empty page
     assert len(driver.print_page()) > 20_000
+    assert driver.execute_script("return document.documentElement.dataset.theme") == theme
+    driver.execute_script("window.dispatchEvent(new Event('beforeprint'))")
+    assert driver.execute_script("return document.documentElement.dataset.theme") == "light"
+    driver.execute_script("window.dispatchEvent(new Event('afterprint'))")
+    assert driver.execute_script("return document.documentElement.dataset.theme") == theme
