@@ -15,6 +15,7 @@ LAYERS = [
     {"team"},
     {"report", "export"},
     {"zoo"},
+    {"study"},
     {"cli"},
 ]
 LEVEL = {package: level for level, packages in enumerate(LAYERS) for package in packages}

@@ -45,6 +45,7 @@ class RunCallbacks:
         eval_env: TeamVecEnv | None,
         signals: EndSignals,
         resumed_from: Path | None = None,
+        after_eval: BaseCallback | None = None,
     ) -> "RunCallbacks":
         """
         Make the callbacks of a run.
@@ -56,6 +57,7 @@ class RunCallbacks:
         :param eval_env: Environment of the evaluations; None for none
         :param signals: Signals that end the training
         :param resumed_from: The checkpoint from which the team was loaded, if the run is continued
+        :param after_eval: Called after each evaluation; None for nothing
         :return: The callbacks
         :raises ConfigError: If one refuses its settings
         """
@@ -78,6 +80,7 @@ class RunCallbacks:
             others.append(
                 (MaskableSeededEvalCallback if team.takes_masks else SeededEvalCallback)(
                     eval_env,
+                    callback_after_eval=after_eval,
                     n_eval_episodes=options.eval_episodes,
                     # SB3's callbacks count their calls: one for each step of all copies, which is n_envs joint steps
                     eval_freq=max(options.eval_freq // config.n_envs, 1),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
@@ -38,7 +39,7 @@ from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train_options import TrainOptions, TrainResult
 
 
-def train(config: RunConfig, options: TrainOptions) -> TrainResult:
+def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | None = None) -> TrainResult:
     """
     Train a team in a new folder ``<log_folder>/<algo>/<env>_<k>/``.
 
@@ -46,6 +47,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
 
     :param config: Configuration of the team and its environment
     :param options: Options of the run
+    :param after_eval: Called after each evaluation, with SB3's ``EvalCallback`` as its parent; None for nothing
     :return: The folder and the team, also if Ctrl-C, SIGTERM or SIGHUP ended the training
     :raises ConfigError: If the environment or the algorithm refuses its settings. Nothing has been written in this case
     :raises RunFailed: If the training fails
@@ -64,7 +66,7 @@ def train(config: RunConfig, options: TrainOptions) -> TrainResult:
         folder = make_run_folder(options.log_folder, config.algo, config.env_id)
         try:
             team = make_team(config, options, env, seed, trained, folder)
-            callbacks = RunCallbacks.make(team, config, options, folder, eval_env, signals)
+            callbacks = RunCallbacks.make(team, config, options, folder, eval_env, signals, after_eval=after_eval)
         except BaseException:
             remove_run_folder(folder)
             raise
