@@ -102,6 +102,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar")
     parser.add_argument(
+        "--track",
+        choices=["wandb", "mlflow"],
+        help="log to Weights & Biases or MLflow too, as their environment variables say (WANDB_MODE, MLFLOW_TRACKING_URI)",
+    )
+    parser.add_argument(
+        "--track-project", type=filled_text, help="project, or experiment, of --track; if left out, sb3-belief"
+    )
+    parser.add_argument(
         "-i", "--trained-agent", type=filled_text, help="folder of a run, or zip of a team, whose training is to be continued"
     )
     parser.add_argument(
@@ -163,7 +171,8 @@ def run(args: argparse.Namespace, command: list[str]) -> int:
         config = resume_config(args.trained_agent, args.algo, args.env, trust=args.trust, **settings)
     names = (
         "log_folder tensorboard_log eval_freq eval_episodes n_eval_envs save_freq save_every"
-        " vec_env step_timeout restart_workers device num_threads jobs on_nan progress trained_agent trust verbose"
+        " vec_env step_timeout restart_workers device num_threads jobs on_nan progress track track_project trained_agent"
+        " trust verbose"
     )
     seed = None if args.seed is None else args.seed[0]
     options = TrainOptions(

@@ -30,7 +30,8 @@ from sb3_belief.zoo.run_folder import (
     write_config,
 )
 from sb3_belief.zoo.run_lock import run_lock
-from sb3_belief.zoo.train import common_arguments, make_envs
+from sb3_belief.zoo.tracking import ENTRY, Tracking, check_tracking
+from sb3_belief.zoo.train import common_arguments, make_envs, track
 from sb3_belief.zoo.train_options import TrainOptions, TrainResult
 
 
@@ -120,6 +121,7 @@ def _go_on(
     if options.seed is None:
         raise ConfigError(f"--resume: {where} does not hold the run's seed: it is damaged.")
     check_device(options.device)
+    check_tracking(options)
     run = run_of_record(folder, before)
     if run is None:
         raise ConfigError(f"--resume: no {CONFIG} in {str(folder)!r}.")
@@ -141,6 +143,7 @@ def _go_on(
     # Before the first step puts it back
     monitor = team.monitor_state
     callbacks = RunCallbacks.make(team, config, options, folder, eval_env, signals, checkpoint)
+    tracking = Tracking.start(config, options, folder, before)
     write_config(folder, config)
     record = RunRecord(
         folder,
@@ -151,7 +154,9 @@ def _go_on(
         device=str(options.device),
         num_threads=th.get_num_threads(),
         jobs=options.jobs,
+        **({} if tracking is None else {ENTRY: tracking.to_record()}),
     )
+    track(tracking, callbacks, record, stack)
     # Of what ended the run before, which the record has forgotten, too
     (folder / TRACEBACK).unlink(missing_ok=True)
     with record.failures():

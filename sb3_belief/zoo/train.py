@@ -36,6 +36,7 @@ from sb3_belief.zoo.run_folder import (
     write_config,
 )
 from sb3_belief.zoo.run_lock import run_lock
+from sb3_belief.zoo.tracking import ENTRY, Tracking, TrackingCallback, check_tracking
 from sb3_belief.zoo.train_options import TrainOptions, TrainResult
 
 
@@ -67,6 +68,7 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
         try:
             team = make_team(config, options, env, seed, trained, folder)
             callbacks = RunCallbacks.make(team, config, options, folder, eval_env, signals, after_eval=after_eval)
+            tracking = Tracking.start(config, options, folder)
         except BaseException:
             remove_run_folder(folder)
             raise
@@ -87,13 +89,29 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
             num_threads=th.get_num_threads(),
             jobs=options.jobs,
             options=options.to_record(),
+            **({} if tracking is None else {ENTRY: tracking.to_record()}),
         )
+        track(tracking, callbacks, record, stack)
         with record.failures():
             env.start_monitor(str(folder))
             if options.verbose:
                 print(f"Run folder: {folder}  (seed {seed})")
             # A team that continues its training continues counting its steps
             return learn_and_save(team, config, options, folder, record, callbacks, signals, trained is None)
+
+
+def track(tracking: Tracking | None, callbacks: RunCallbacks, record: RunRecord, stack: ExitStack) -> None:
+    """
+    Have a run be logged to a tracker until it ends.
+
+    :param tracking: The run's log; None for none
+    :param callbacks: Callbacks of the run
+    :param record: Record of the run, which says at its end how it has ended
+    :param stack: Closes the log at its end
+    """
+    if tracking is not None:
+        callbacks.others.append(TrackingCallback(tracking))
+        stack.callback(lambda: tracking.finish(record.content["status"]))
 
 
 def make_envs(config: RunConfig, options: TrainOptions, stack: ExitStack) -> tuple[TeamVecEnv, TeamVecEnv | None]:
@@ -154,6 +172,7 @@ def _check_options(config: RunConfig, options: TrainOptions) -> None:
     for _, kwargs in config.callbacks:
         if isinstance(kwargs.get("save_path"), str):
             check_folder(kwargs["save_path"], f"{config.origin('callback:')}: callback: save_path")
+    check_tracking(options)
     check_optimizers(config, options.device)
     check_copies(config.n_envs, options.vec_env, config.origin("n_envs"))
     if options.step_timeout > 0 and options.vec_env != "subproc":

@@ -37,6 +37,8 @@ class TrainOptions:
         learns wholly in one of them. The result is the same for any number, to the bit on the CPU. See ``Team``
     :param on_nan: ``"raise"`` or ``"skip"``: what is done when loss or parameters are not finite. See ``Team``
     :param progress: Whether to show a progress bar
+    :param track: Experiment tracker that the run is logged to, ``"wandb"`` or ``"mlflow"``; None for none
+    :param track_project: Its project, or experiment; None for "sb3-belief"
     :param trained_agent: Folder of a run, or zip of a team, whose training is to be continued
     :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
     :param trust: Whether to load the saved team even if it could run any code
@@ -60,6 +62,8 @@ class TrainOptions:
     jobs: int = 1
     on_nan: str = "raise"
     progress: bool = False
+    track: str | None = None
+    track_project: str | None = None
     trained_agent: str | None = None
     extra_packages: tuple[str, ...] = ()
     trust: bool = False
