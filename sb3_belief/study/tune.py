@@ -56,13 +56,11 @@ def tune(options: TuneOptions) -> int:
     check_folder(folder, "-f")
     begin(spec, folder)
     print(f"Tuning: {folder}  ({spec.n_trials} trials of {spec.algo} on {spec.env})", flush=True)
-    try:
-        if options.jobs == 1:
-            status = run_trials(spec, folder, options.extra_packages, _say)
-        else:
-            status = _run_workers(folder, options)
-    finally:
-        update_results(folder, spec, options.extra_packages)
+    if options.jobs == 1:
+        status = run_trials(spec, folder, options.extra_packages, _say)
+    else:
+        status = _run_workers(folder, options)
+    update_results(folder, spec, options.extra_packages)
     _tell_best(folder, spec)
     return status
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.study.trials_table import write_best, write_trials
 from sb3_belief.study.tuning_spec import TuningSpec
 from sb3_belief.study.tuning_storage import Storage
-from sb3_belief.zoo.errors import ConfigError, RunFailed, cause
+from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of
 from sb3_belief.zoo.preflight import check_folder
 from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train import train
@@ -75,6 +75,7 @@ def run_trials(
     storage, tally = Storage(folder, spec), Tally()
     while goes_on() and tally.exit_status == 0:
         with ExitStack() as stack:
+            stack.enter_context(storage.writing())
             with exclusive(folder):
                 storage.give_up_killed()
                 trial = storage.draw()
@@ -105,10 +106,13 @@ def update_results(folder: Path, spec: TuningSpec, extra_packages: tuple[str, ..
     :param spec: Its specification
     :param extra_packages: See ``names.resolve``
     """
-    with exclusive(folder):
-        trials = Storage(folder, spec).trials()
-        write_trials(folder, spec, trials)
-        write_best(folder, spec, trials, extra_packages)
+    try:
+        with exclusive(folder):
+            trials = Storage(folder, spec).trials()
+            write_trials(folder, spec, trials)
+            write_best(folder, spec, trials, extra_packages)
+    except OSError as error:
+        raise RunFailed(f"The results of {folder} could not be written ({reason_of(error)}).") from error
 
 
 @contextmanager

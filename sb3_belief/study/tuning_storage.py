@@ -1,12 +1,14 @@
 """The storage of a tuning's trials, in SQLite, and what is drawn next."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sb3_belief.study.tuning_spec import TuningSpec
-from sb3_belief.zoo.errors import ConfigError, cause
+from sb3_belief.zoo.errors import ConfigError, RunFailed, cause
 from sb3_belief.zoo.run_lock import run_lock
 
 if TYPE_CHECKING:
@@ -51,6 +53,26 @@ class Storage:
             raise ConfigError(
                 f"{folder / STORAGE}: cannot be used as Optuna's storage ({reason}): restore it, or give the tuning"
                 " another name."
+            ) from error
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """
+        Say in one line that the storage cannot be written, for example because the disk is full.
+
+        :raises RunFailed: If so. A trial that was being trained counts as killed from then on
+        """
+        import optuna
+        import sqlalchemy
+
+        try:
+            yield
+        except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+            known = error if isinstance(error, sqlalchemy.exc.SQLAlchemyError) else error.__cause__ or error
+            reason = str(getattr(known, "orig", None) or known).splitlines()[0]
+            raise RunFailed(
+                f"The tuning cannot go on: {self._folder / STORAGE} could not be written ({reason}). The same"
+                " command continues it."
             ) from error
 
     def trial_folder(self, number: int) -> Path:

@@ -88,7 +88,7 @@ def _text(content: CardContent) -> str:
     kinds = sorted(set(content.algorithms.values()))
     rows = {
         "Environment": f"`{record['env']}`",
-        "Arguments of the environment": f"`{json.dumps(content.settings.get('env_kwargs', {}))}`",
+        "Arguments of the environment": f"`{json.dumps(content.settings.get('env_kwargs', {}))}`".replace("|", "\\|"),
         "Algorithm": f"`{record['algo']}` ({', '.join(kinds)})",
         "Agents": f"{len(content.algorithms)}, each with a model of its own: {', '.join(map(_code, content.algorithms))}",
         "Joint steps of training": f"{content.joint_steps:,}",
@@ -103,7 +103,7 @@ def _text(content: CardContent) -> str:
     }
     parts = [
         f"# {repo_id.rpartition('/')[2]}",
-        "A team that was trained with [sb3-belief](https://pypi.org/project/sb3-belief/): each agent is a model of"
+        "A team that was trained with sb3-belief: each agent is a model of"
         " Stable-Baselines3 that has learned by itself from what it observed itself.",
         _table({"": "", **rows}),
         "## Score",

@@ -228,3 +228,30 @@ def test_a_damaged_storage_is_said_and_kept(undisturbed, tmp_path, capsys):
     status, _ = tune(tmp_path)
     assert status == 2 and "study.db: cannot be used as Optuna's storage" in capsys.readouterr().err
     assert (folder / "study.db").read_bytes() == half
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder in a file system of its own, of 2 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2000k", "tmpfs", str(folder)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("a small file system can be mounted by root only")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.slow
+def test_a_full_disk_stops_the_tuning_and_loses_no_result(undisturbed, small_disk, capsys):
+    file = written(small_disk, **FAST)
+    assert main(["tune", str(file), "-f", str(small_disk)]) == 1
+    said = capsys.readouterr()
+    assert "Failed: The tuning cannot go on: " in said.err and len(said.err.strip().splitlines()) <= 3
+    finished = [line for line in said.out.splitlines() if line.startswith("Trial ")]
+    subprocess.run(["mount", "-o", "remount,size=60m", str(small_disk)], check=True)
+    assert main(["tune", str(file), "-f", str(small_disk)]) == 0
+    again = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Trial ")]
+    assert len(finished) + len(again) == 4
+    rows = rows_of(small_disk / "tiny")
+    assert list(results(rows).values()) == list(results(rows_of(undisturbed)).values())
