@@ -146,12 +146,13 @@ def load_config(
     extra_packages: tuple[str, ...] = (),
     eval_env_kwargs: Sequence[str] = (),
     run_folder: Path | None = None,
+    overrides: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> RunConfig:
     """
     Load, merge and check the settings of a run.
 
-    Later sources override earlier ones: the file's section ``default``, its section of the environment, ``params``,
-    ``env_kwargs``, ``n_timesteps``.
+    Later sources override earlier ones: the file's section ``default``, its section of the environment, ``overrides``,
+    ``params``, ``env_kwargs``, ``n_timesteps``.
 
     :param algo: Name of the algorithm, a key of ``names.ALGOS``
     :param env_id: Registered id, ``suite/name`` or ``module:callable`` of the environment
@@ -162,6 +163,7 @@ def load_config(
     :param extra_packages: See ``names.resolve``
     :param eval_env_kwargs: ``key:value`` pairs of arguments of the environment of evaluations, which override ``env_kwargs``
     :param run_folder: Folder of the run whose file ``conf_file`` is, if its author may be a stranger, who may write there only
+    :param overrides: Further settings as data, each with the place that they come from, for the error message
     :return: The configuration
     :raises ConfigError: For a setting that does not fit. The message names its location, what is allowed and the nearest match
     """
@@ -181,7 +183,7 @@ def load_config(
         for name in (DEFAULT, env_id)
         if name in sections
     ]
-    given: list[tuple[str, Any]] = [("-params", parse_pairs(params, "-params"))]
+    given: list[tuple[str, Any]] = [*overrides, ("-params", parse_pairs(params, "-params"))]
     for flag, pairs in (("--env-kwargs", env_kwargs), ("--eval-env-kwargs", eval_env_kwargs)):
         if pairs:
             given.append((flag, {flag[2:].replace("-", "_"): parse_pairs(pairs, flag)}))

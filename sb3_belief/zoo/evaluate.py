@@ -1,6 +1,6 @@
 """Returns and success rates of a team, measured by playing episodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,12 @@ class Outcome:
 
     :param returns: The team's return of each episode, float ``[k]``
     :param successes: Whether each episode succeeded, bool ``[k]``. Empty if the environment does not report successes
+    :param lengths: Number of joint steps of each episode, int ``[k]``. Empty if nobody counted them
     """
 
     returns: np.ndarray
     successes: np.ndarray
+    lengths: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
     def success_rate(self) -> float | None:
@@ -53,7 +55,7 @@ def evaluate(model: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool =
 
     # Only sb3-contrib's evaluation passes the environment's action masks on
     run = evaluate_masked if getattr(model, "takes_masks", False) else evaluate_policy
-    returns, _ = run(
+    returns, lengths = run(
         model,
         env,
         n_eval_episodes=n_episodes,
@@ -61,4 +63,4 @@ def evaluate(model: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool =
         callback=record_success,
         return_episode_rewards=True,
     )
-    return Outcome(np.asarray(returns, dtype=float), np.asarray(successes, dtype=bool))
+    return Outcome(np.asarray(returns, dtype=float), np.asarray(successes, dtype=bool), np.asarray(lengths, dtype=np.int64))
