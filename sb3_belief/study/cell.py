@@ -85,7 +85,7 @@ def _run(cell: Cell, extra_packages: tuple[str, ...]) -> int:
         print(f"Failed: {error}", file=sys.stderr)
         return 1
     start = time.monotonic()
-    status, what = 0, {}
+    status, what = 0, dict[str, Any]()
     try:
         with EndSignals():
             status, what = _train_and_evaluate(cell, record, extra_packages)

@@ -1,5 +1,6 @@
 """What is checked before a study writes anything: every cell's settings, every environment, what it needs installed."""
 
+import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -171,7 +172,10 @@ def _check_environment(study: Study, configs: dict[str, RunConfig]) -> None:
             if config.eval_env_kwargs:
                 evaluated = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
                 check_eval_env(config, env, _made_environment(evaluated, seed, stack))
-            make_team(config, TrainOptions(verbose=0, device="cpu"), env, study.seeds[0])
+            with warnings.catch_warnings():
+                # SB3 warns of sizes that only fit the run's own number of copies
+                warnings.simplefilter("ignore")
+                make_team(config, TrainOptions(verbose=0, device="cpu"), env, study.seeds[0])
 
 
 def _made_environment(config: RunConfig, seed: int, stack: ExitStack) -> TeamVecEnv:

@@ -218,6 +218,7 @@ def _arms(section: Section) -> dict[str, Arm]:
 
 def _places(section: Section) -> dict[str, Place]:
     places: dict[str, Place] = {}
+    pairs: list[tuple[Any, Section, Any]]
     if isinstance(section.value, list):
         pairs = [(each.value, each, {}) for each in section.items("ids of environments")]
     else:
