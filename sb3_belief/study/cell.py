@@ -92,9 +92,9 @@ def _run(cell: Cell, extra_packages: tuple[str, ...]) -> int:
     except KeyboardInterrupt as error:
         status = error.exit_status if isinstance(error, Interrupted) else 128 + signal.SIGINT
     except BaseException as error:
-        status, what = 1, {"error": cause(error)}
         # The run's own error tells more than that the run has failed
         shown = error.__cause__ if isinstance(error, RunFailed) and error.__cause__ is not None else error
+        status, what = 1, {"error": cause(shown)}
         write_traceback(cell.folder, shown)
         print(f"Failed: {what['error']}", file=sys.stderr)
     record.update(what, status=FINISHED if status == 0 else FAILED if status == 1 else WAITING)

@@ -2,10 +2,11 @@
 Running the cells of a study as tasks of a Ray cluster, a task each.
 
 All nodes need this package, in the same version, and the folder of the study at the same path (a network file system). A task
-starts the cell in a process of its own, as on one machine. Ray repeats a task whose node is lost on another one, where the cell
-goes on from its last checkpoint.
+starts the cell in a process of its own, as on one machine. Ray repeats a task whose node is lost on another one, where the
+cell goes on from its last checkpoint.
 """
 
+import platform
 import secrets
 import signal
 import tempfile
@@ -130,8 +131,8 @@ def run_cell_in_task(cell_folder: str, folder: str, token: str, extra_packages: 
         seen = (Path(folder) / TOKEN_FILE).read_text(encoding="utf-8")
     if seen != token:
         return (
-            f"the node {_node()} does not see the folder {folder} of the study: all nodes must share it, at the same path, such"
-            " as by a network file system."
+            f"the node {platform.node()} does not see the folder {folder} of the study: all nodes must share it, at the same"
+            " path, such as by a network file system."
         )
     cell = Cell(Path(cell_folder))
     while True:
@@ -150,8 +151,3 @@ def run_cell_in_task(cell_folder: str, folder: str, token: str, extra_packages: 
         return None
     return record["error"] or (lines or [f"its process ended with status {status}"])[-1].removeprefix("Failed: ")
 
-
-def _node() -> str:
-    import platform
-
-    return platform.node()

@@ -75,11 +75,15 @@ def run_study(options: StudyOptions) -> int:
         else:
             result = run_local(cells, jobs, display, options.extra_packages)
     failed = _say_failures(cells, result)
-    path = write_table(folder, cells)
+    try:
+        print(f"Episodes: {write_table(folder, cells)}")
+    except ConfigError as error:
+        # The cells' own files are there, and starting the study again makes the table of them
+        print(f"Failed: {error}", file=sys.stderr)
+        failed += 1
     if result.exit_status:
         print("Interrupted. The same command goes on.", file=sys.stderr)
         return result.exit_status
-    print(f"Episodes: {path}")
     return 1 if failed else 0
 
 
