@@ -73,22 +73,23 @@ def _run(cell: Cell, extra_packages: tuple[str, ...]) -> int:
     # Imported here, as all that takes seconds, so that the lock is there before
     from sb3_belief.zoo.endings import TRACEBACK, EndSignals, Interrupted, write_traceback
 
-    try:
-        record = cell.read()
-        if record["status"] == FINISHED:
-            return 0
-        sweep_temporary_files(cell.folder)
-        (cell.folder / TRACEBACK).unlink(missing_ok=True)
-        record.update(status=RUNNING, attempts=record["attempts"] + 1, error=None)
-        cell.write(record)
-    except (ConfigError, OSError) as error:
-        print(f"Failed: {error}", file=sys.stderr)
-        return 1
     start = time.monotonic()
+    record: dict[str, Any] | None = None
     status, what = 0, dict[str, Any]()
     try:
-        with EndSignals():
-            status, what = _train_and_evaluate(cell, record, extra_packages)
+        with EndSignals() as signals:
+            try:
+                record = cell.read()
+                if record["status"] == FINISHED:
+                    return 0
+                sweep_temporary_files(cell.folder)
+                (cell.folder / TRACEBACK).unlink(missing_ok=True)
+                record.update(status=RUNNING, attempts=record["attempts"] + 1, error=None)
+                cell.write(record)
+                status, what = _train_and_evaluate(cell, record, extra_packages)
+            finally:
+                # What is left is to write down how it ended
+                signals.hold()
     except KeyboardInterrupt as error:
         status = error.exit_status if isinstance(error, Interrupted) else 128 + signal.SIGINT
     except BaseException as error:
@@ -97,6 +98,8 @@ def _run(cell: Cell, extra_packages: tuple[str, ...]) -> int:
         status, what = 1, {"error": cause(shown)}
         write_traceback(cell.folder, shown)
         print(f"Failed: {what['error']}", file=sys.stderr)
+    if record is None:
+        return status
     record.update(what, status=FINISHED if status == 0 else FAILED if status == 1 else WAITING)
     record["seconds"] = round(record.get("seconds", 0.0) + time.monotonic() - start, 1)
     record["cpu_seconds"] = round(record.get("cpu_seconds", 0.0) + _cpu_seconds(), 1)
