@@ -76,32 +76,36 @@ def _run(cell: Cell, extra_packages: tuple[str, ...]) -> int:
     start = time.monotonic()
     record: dict[str, Any] | None = None
     status, what = 0, dict[str, Any]()
-    try:
-        with EndSignals() as signals:
-            try:
-                record = cell.read()
-                if record["status"] == FINISHED:
-                    return 0
-                sweep_temporary_files(cell.folder)
-                (cell.folder / TRACEBACK).unlink(missing_ok=True)
-                record.update(status=RUNNING, attempts=record["attempts"] + 1, error=None)
-                cell.write(record)
-                status, what = _train_and_evaluate(cell, record, extra_packages)
-            finally:
-                # What is left is to write down how it ended
-                signals.hold()
-    except KeyboardInterrupt as error:
-        status = error.exit_status if isinstance(error, Interrupted) else 128 + signal.SIGINT
-    except BaseException as error:
-        # The run's own error tells more than that the run has failed
-        shown = error.__cause__ if isinstance(error, RunFailed) and error.__cause__ is not None else error
-        status, what = 1, {"error": cause(shown)}
-        write_traceback(cell.folder, shown)
-        print(f"Failed: {what['error']}", file=sys.stderr)
-    if record is None:
-        return status
+    with EndSignals() as signals:
+        try:
+            record = cell.read()
+            if record["status"] == FINISHED:
+                return 0
+            sweep_temporary_files(cell.folder)
+            (cell.folder / TRACEBACK).unlink(missing_ok=True)
+            record.update(status=RUNNING, attempts=record["attempts"] + 1, error=None)
+            cell.write(record)
+            status, what = _train_and_evaluate(cell, record, extra_packages)
+            signals.hold()
+        except BaseException as caught:
+            signals.hold()
+            error = signals.cause_of(caught)
+            if isinstance(error, KeyboardInterrupt):
+                status = error.exit_status if isinstance(error, Interrupted) else 128 + signal.SIGINT
+            else:
+                # The run's own error tells more than that the run has failed
+                shown = error.__cause__ if isinstance(error, RunFailed) and error.__cause__ is not None else error
+                status, what = 1, {"error": cause(shown)}
+                write_traceback(cell.folder, shown)
+                print(f"Failed: {what['error']}", file=sys.stderr)
+        # Within the context, so that a second signal does not end this
+        return status if record is None else _write_down(cell, record, status, what, time.monotonic() - start)
+
+
+def _write_down(cell: Cell, record: dict[str, Any], status: int, what: dict[str, Any], seconds: float) -> int:
+    """Record how a cell has ended, and return its exit status."""
     record.update(what, status=FINISHED if status == 0 else FAILED if status == 1 else WAITING)
-    record["seconds"] = round(record.get("seconds", 0.0) + time.monotonic() - start, 1)
+    record["seconds"] = round(record.get("seconds", 0.0) + seconds, 1)
     record["cpu_seconds"] = round(record.get("cpu_seconds", 0.0) + _cpu_seconds(), 1)
     try:
         cell.write(record)

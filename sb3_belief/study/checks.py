@@ -64,10 +64,14 @@ class CheckedStudy:
             for arm in study.arms:
                 if (arm, env_id) in self.configs:
                     config = self.configs[arm, env_id]
-                    lines.append(
-                        f"  {arm:<{width}}  {config.algo}: {_count(seeds, 'run')} of {config.n_timesteps:,} joint steps,"
-                        f" {config.n_timesteps // evaluation.every} x {evaluation.episodes} episodes while training,"
+                    played = (
+                        f"{config.n_timesteps // evaluation.every} x {evaluation.episodes} episodes while training,"
                         f" 4 x {evaluation.final_episodes} at the end"
+                    )
+                    if evaluation.online:
+                        played = f"whose own episodes count, the last {evaluation.final_episodes} at the end"
+                    lines.append(
+                        f"  {arm:<{width}}  {config.algo}: {_count(seeds, 'run')} of {config.n_timesteps:,} joint steps, {played}"
                     )
         return "\n".join(lines)
 

@@ -211,10 +211,8 @@ class _Pool:
             return
         tell(f"Saving {len(self._running)} runs. Starting the study again goes on with them.")
         for each in self._running:
-            # On Windows this would kill it; there the closed pipe tells it
-            if os.name != "nt":
-                each.process.terminate()
             assert each.process.stdin is not None
+            # Which tells it as a signal would, and on Windows, too, where that would kill it
             with suppress(OSError):
                 each.process.stdin.close()
         for each in self._running:

@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_belief.common.safe_files.trust import Trust
+from sb3_belief.report.learning_curve import read_monitor
 from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
@@ -54,6 +55,8 @@ def episode_rows(
         "environment": cell["env"],
         "seed": cell["seed"],
     }
+    if cell.get("online_every") is not None:
+        return [{**common, **row} for row in online_rows(run, cell["online_every"], cell["final_episodes"])]
     rows, best_steps, reports_success = _training_rows(run)
     trained = read_record(run).get("timesteps", cell["n_timesteps"])
     checkpoints = [("last", TEAM, trained)]
@@ -71,6 +74,31 @@ def episode_rows(
                 kind = {"phase": "final", "checkpoint": checkpoint, "deterministic": deterministic, "joint_steps": int(steps)}
                 rows += [{**kind, **each} for each in played]
     return [{**common, **row} for row in rows]
+
+
+def online_rows(run: Path, every: int, n_final: int) -> list[dict[str, Any]]:
+    """
+    Return the episodes that a team played while it learned, with sampled actions.
+
+    :param run: Folder of the run
+    :param every: Joint steps between the points of a curve, each of which has the episodes that ended since the last one
+    :param n_final: How many of the last episodes count as the final evaluation of the last weights
+    :return: A dictionary an episode
+    :raises ValueError: If the monitor file is damaged
+    """
+    ends, returns, successes = read_monitor(run)
+    lengths = np.diff(ends, prepend=0).astype(np.int64)
+    won = None if np.isnan(successes).any() else successes
+    rows = []
+    for first in range(0, int(ends[-1]) - every + 1 if len(ends) else 0, every):
+        inside = (ends > first) & (ends <= first + every)
+        kind = {"phase": "training", "checkpoint": "current", "deterministic": False, "joint_steps": first + every}
+        rows += [
+            {**kind, **each} for each in _numbered(returns[inside], None if won is None else won[inside], lengths[inside])
+        ]
+    last = slice(max(len(ends) - n_final, 0), None)
+    kind = {"phase": "final", "checkpoint": "last", "deterministic": False, "joint_steps": int(ends[-1]) if len(ends) else 0}
+    return rows + [{**kind, **each} for each in _numbered(returns[last], None if won is None else won[last], lengths[last])]
 
 
 def _training_rows(run: Path) -> tuple[list[dict[str, Any]], int | None, bool]:

@@ -150,4 +150,3 @@ def run_cell_in_task(cell_folder: str, folder: str, token: str, extra_packages: 
     if record["status"] == FINISHED:
         return None
     return record["error"] or (lines or [f"its process ended with status {status}"])[-1].removeprefix("Failed: ")
-

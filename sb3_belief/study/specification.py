@@ -21,7 +21,7 @@ _KEYS = (
     *("name", "environments", "algorithms", "seeds", "n_timesteps", "evaluation"),
     *("baseline", "ablations", "exclude", "train"),
 )
-_EVALUATION = ("every", "episodes", "copies", "final_episodes")
+_EVALUATION = ("every", "episodes", "copies", "final_episodes", "online")
 #: The options of ``train`` that a study may set, without those that it sets itself
 TRAIN_KEYS = (
     *("save_every", "save_freq", "device", "num_threads", "jobs", "on_nan"),
@@ -72,12 +72,15 @@ class Evaluation:
     :param episodes: Episodes of each of them
     :param copies: Environment copies in which evaluations are played
     :param final_episodes: Episodes of each of the final evaluations
+    :param online: Whether the episodes of the training count instead, as they were played, the last ones as final ones. It is
+        for games in which others change while one learns, so that an evaluation apart would not meet those of the moment
     """
 
     every: int = 25_000
     episodes: int = 32
     copies: int = 32
     final_episodes: int = 320
+    online: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,8 @@ class Study:
 
         :return: The keys of the file with what was left out there
         """
-        evaluation = {name: getattr(self.evaluation, name) for name in _EVALUATION}
+        unused = ("episodes", "copies") if self.evaluation.online else ("online",)
+        evaluation = {name: getattr(self.evaluation, name) for name in _EVALUATION if name not in unused}
         data: dict[str, Any] = {
             "name": self.name,
             "environments": {env_id: place.overrides for env_id, place in self.places.items()},
@@ -177,8 +181,6 @@ def load_study(path: Path) -> Study:
         raise place.error(f"name: {short(name)} cannot be the name of a folder: letters, digits and any of . _ + - only.")
     arms = _arms(top["algorithms"])
     places = _places(top["environments"])
-    evaluation = top["evaluation"].mapping("settings of evaluations", _EVALUATION) if "evaluation" in top else None
-    counts = {key: evaluation[key].number(1, _MOST, key) for key in evaluation.value} if evaluation is not None else {}
     study = Study(
         name=name,
         source=str(path),
@@ -186,7 +188,7 @@ def load_study(path: Path) -> Study:
         arms=arms,
         seeds=_seeds(top["seeds"]),
         n_timesteps=top["n_timesteps"].number(1, _MOST, "joint steps") if "n_timesteps" in top else None,
-        evaluation=Evaluation(**counts),
+        evaluation=_evaluation(top["evaluation"]) if "evaluation" in top else Evaluation(),
         baseline=top["baseline"].chosen("algorithm of this study", arms) if "baseline" in top else None,
         ablations=_ablations(top["ablations"], arms) if "ablations" in top else {},
         excluded=_excluded(top["exclude"], arms, places) if "exclude" in top else frozenset(),
@@ -241,6 +243,24 @@ def _places(section: Section) -> dict[str, Place]:
     if not places:
         raise section.error("must have at least one environment.")
     return places
+
+
+def _evaluation(section: Section) -> Evaluation:
+    chosen: dict[str, Any] = {}
+    for key in section.mapping("settings of evaluations", _EVALUATION).value:
+        own = section[key]
+        if key == "online":
+            if not isinstance(own.value, bool):
+                raise own.error(f"must be true or false, not {short(own.value)}.")
+            chosen[key] = own.value
+        else:
+            chosen[key] = own.number(1, _MOST, key)
+    if chosen.get("online") and (unused := chosen.keys() & {"episodes", "copies"}):
+        name = sorted(unused)[0]
+        raise section[name].error(
+            "has no use with online: true, with which nothing is played beside the training: leave it out."
+        )
+    return Evaluation(**chosen)
 
 
 def _seeds(section: Section) -> tuple[int, ...]:

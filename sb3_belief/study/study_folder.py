@@ -61,6 +61,8 @@ def planned_cells(study: Study, folder: Path, configs: dict[tuple[str, str], Run
                 "run": None,
                 "n_timesteps": config.n_timesteps,
                 "final_episodes": study.evaluation.final_episodes,
+                # Joint steps between the points of a curve of the training's own episodes; None for evaluations apart
+                "online_every": study.evaluation.every if study.evaluation.online else None,
                 "options": cell_options(study),
                 "settings": config.settings,
             }
@@ -91,7 +93,7 @@ def cell_options(study: Study) -> dict[str, Any]:
     return {
         **defaults,
         **study.train,
-        "eval_freq": evaluation.every,
+        "eval_freq": -1 if evaluation.online else evaluation.every,
         "eval_episodes": evaluation.episodes,
         "n_eval_envs": evaluation.copies,
     }
@@ -130,7 +132,7 @@ def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     options = {name: value for name, value in now["options"].items() if name not in FREE_OPTIONS}
     found = [
         f"{name} was {short(before.get(name))} and is {short(now[name])}"
-        for name in ("study", "arm", "algo", "env", "seed", "final_episodes")
+        for name in ("study", "arm", "algo", "env", "seed", "final_episodes", "online_every")
         if before.get(name) != now[name]
     ]
     for old, new, names in (

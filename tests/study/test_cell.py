@@ -132,3 +132,27 @@ def test_half_a_record_is_refused(finished, tmp_path):
     with pytest.raises(ConfigError, match=r"cell.json: is damaged.*Move the folder"):
         copy.read()
     assert main([str(copy.folder)]) == 1
+
+
+def test_episodes_of_the_training_itself(tmp_path):
+    changes = {
+        "environments": {"convention-redraw": {"n_envs": 5, "batch_size": 80}},
+        "algorithms": {"none": {"algo": "ippo"}},
+    }
+    online = {"online": True, "every": 160, "final_episodes": 12}
+    (cell,) = prepared(tmp_path, **changes, evaluation=online, n_timesteps=480)
+    assert main([str(cell.folder)]) == 0
+    (run,) = (cell.folder / "ippo").iterdir()
+    assert not (run / "evaluations.npz").exists()
+    with open(run / "monitor.csv") as file:
+        monitor = [float(line.split(",")[0]) for line in file.readlines()[2:]]
+    # 480 joint steps of episodes of 16, and for each point of the curve those that ended since the last one
+    table = rows(cell)
+    assert len(monitor) == 30
+    curve = [row for row in table if row["phase"] == "training"]
+    assert [row["joint_steps"] for row in curve] == [160] * 10 + [320] * 10 + [480] * 10
+    assert [row["episode_return"] for row in curve] == monitor
+    final = [row for row in table if row["phase"] == "final"]
+    assert [row["episode_return"] for row in final] == monitor[-12:]
+    assert {(row["checkpoint"], row["deterministic"], row["joint_steps"]) for row in final} == {("last", False, 480)}
+    assert {row["length"] for row in table} == {16} and {row["success"] for row in table} == {None}
