@@ -1,7 +1,7 @@
 """What is checked before a study writes anything: every cell's settings, every environment, what it needs installed."""
 
 import warnings
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from inspect import signature
@@ -70,9 +70,8 @@ class CheckedStudy:
                     )
                     if evaluation.online:
                         played = f"whose own episodes count, the last {evaluation.final_episodes} at the end"
-                    lines.append(
-                        f"  {arm:<{width}}  {config.algo}: {_count(seeds, 'run')} of {config.n_timesteps:,} joint steps, {played}"
-                    )
+                    runs = f"{_count(seeds, 'run')} of {config.n_timesteps:,} joint steps"
+                    lines.append(f"  {arm:<{width}}  {config.algo}: {runs}, {played}")
         return "\n".join(lines)
 
 
@@ -142,7 +141,10 @@ def _config_without_env(study: Study, arm: str, env_id: str, extra_packages: tup
     path = find_config_file(algo)
     layers = [(f"{path}, section {env_id}", read_file(path).get(env_id) or {}), *study.overrides(arm, env_id)]
     kept = [(where, {key: value for key, value in layer.items() if key not in _OF_ENV}) for where, layer in layers]
-    return replace(load_config(algo, _STAND_IN, extra_packages=extra_packages, overrides=kept), env_id=env_id)
+    config = load_config(algo, _STAND_IN, extra_packages=extra_packages, overrides=kept)
+    with closing(make_env(replace(config, env_kwargs={}, wrapper=None), _COPIES, 0)) as env:
+        _try_team(config, env)
+    return replace(config, env_id=env_id)
 
 
 def _check_length(study: Study, arm: str, config: RunConfig) -> RunConfig:
@@ -176,10 +178,14 @@ def _check_environment(study: Study, configs: dict[str, RunConfig]) -> None:
             if config.eval_env_kwargs:
                 evaluated = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
                 check_eval_env(config, env, _made_environment(evaluated, seed, stack))
-            with warnings.catch_warnings():
-                # SB3 warns of sizes that only fit the run's own number of copies
-                warnings.simplefilter("ignore")
-                make_team(config, TrainOptions(verbose=0, device="cpu"), env, study.seeds[0])
+            _try_team(config, env)
+
+
+def _try_team(config: RunConfig, env: TeamVecEnv) -> None:
+    with warnings.catch_warnings():
+        # SB3 warns of sizes that only fit the run's own number of copies
+        warnings.simplefilter("ignore")
+        make_team(config, TrainOptions(verbose=0, device="cpu"), env, 0)
 
 
 def _made_environment(config: RunConfig, seed: int, stack: ExitStack) -> TeamVecEnv:

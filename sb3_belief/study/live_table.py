@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from sb3_belief.study.cell_record import FAILED, FINISHED, RUNNING, Cell, steps_done
 from sb3_belief.zoo.errors import ConfigError
@@ -116,23 +117,23 @@ def duration_text(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def matrix_table(name: str, states: Sequence[CellState], left: float | None) -> Table:
+def matrix_table(name: str, states: Sequence[CellState], left: float | None) -> Group:
     """
-    Return the table of cells, a row for each algorithm and a column for each environment.
+    Return the table of cells, a row for each algorithm and a column for each environment, under a line for all.
 
     :param name: Name of the study
     :param states: Of all cells
     :param left: Seconds that are left, None if unknown
-    :return: A table of rich
+    :return: What rich prints
     """
     arms, envs = (list(dict.fromkeys(getattr(each, key) for each in states)) for key in ("arm", "env_id"))
-    table = Table(title=f"{name}: {summary(states, left)}", title_justify="left", expand=False)
+    table = Table()
     table.add_column("")
     for env_id in envs:
         table.add_column(env_id, overflow="fold")
     for arm in arms:
         table.add_row(arm, *(_cell_text([s for s in states if (s.arm, s.env_id) == (arm, env_id)]) for env_id in envs))
-    return table
+    return Group(Text(f"{name}: {summary(states, left)}"), table)
 
 
 def _cell_text(states: Sequence[CellState]) -> str:
@@ -222,7 +223,7 @@ class StudyDisplay:
             self._look()
             self._live.update(self._table())
 
-    def _table(self) -> Table:
+    def _table(self) -> Group:
         return matrix_table(self._name, self._states, self._left.estimate(self._states))
 
     def _line(self) -> str:

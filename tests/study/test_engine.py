@@ -70,7 +70,7 @@ def test_every_cell_runs_once_and_no_more_than_jobs_at_a_time(study):
     assert {cell.read()["status"] for cell in cells} == {"finished"}
     events = sorted((float(line.split()[2]), line.split()[1]) for line in journal.read_text().splitlines())
     at_once = [sum(1 if kind == "begin" else -1 for _, kind in events[: i + 1]) for i in range(len(events))]
-    assert max(at_once) == 2
+    assert max(at_once) <= 2
     assert display.told.count("arm/env/seed_0: finished") == 1
     # Nothing is left to do
     run()
