@@ -28,7 +28,7 @@ BUSY = 75
 _PATIENCE = 120.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def cell_main(argv: Sequence[str] | None = None) -> int:
     """
     Run a cell to its end, unless another process does.
 
@@ -170,4 +170,4 @@ def _train(cell: Cell, record: dict[str, Any], config: Any, extra_packages: tupl
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(cell_main())

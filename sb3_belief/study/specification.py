@@ -49,7 +49,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Place:
+class StudyEnvironment:
     """
     An environment of a study.
 
@@ -64,7 +64,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluationPlan:
     """
     When and how long teams are evaluated.
 
@@ -103,11 +103,11 @@ class Study:
 
     name: str
     source: str
-    places: dict[str, Place]
+    places: dict[str, StudyEnvironment]
     arms: dict[str, Arm]
     seeds: tuple[int, ...]
     n_timesteps: int | None = None
-    evaluation: Evaluation = field(default_factory=Evaluation)
+    evaluation: EvaluationPlan = field(default_factory=EvaluationPlan)
     baseline: str | None = None
     ablations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     excluded: frozenset[tuple[str, str]] = frozenset()
@@ -188,7 +188,7 @@ def load_study(path: Path) -> Study:
         arms=arms,
         seeds=_seeds(top["seeds"]),
         n_timesteps=top["n_timesteps"].number(1, _MOST, "joint steps") if "n_timesteps" in top else None,
-        evaluation=_evaluation(top["evaluation"]) if "evaluation" in top else Evaluation(),
+        evaluation=_evaluation(top["evaluation"]) if "evaluation" in top else EvaluationPlan(),
         baseline=top["baseline"].chosen("algorithm of this study", arms) if "baseline" in top else None,
         ablations=_ablations(top["ablations"], arms) if "ablations" in top else {},
         excluded=_excluded(top["exclude"], arms, places) if "exclude" in top else frozenset(),
@@ -218,8 +218,8 @@ def _arms(section: Section) -> dict[str, Arm]:
     return arms
 
 
-def _places(section: Section) -> dict[str, Place]:
-    places: dict[str, Place] = {}
+def _places(section: Section) -> dict[str, StudyEnvironment]:
+    places: dict[str, StudyEnvironment] = {}
     pairs: list[tuple[Any, Section, Any]]
     if isinstance(section.value, list):
         pairs = [(each.value, each, {}) for each in section.items("ids of environments")]
@@ -239,13 +239,13 @@ def _places(section: Section) -> dict[str, Place]:
         if same != env_id:
             raise own.error(f"{env_id!r} and {same!r} would have the same folder: make them two studies.")
         where = own.where if env_id in own.keys else f"{own.where}: {env_id}"
-        places[env_id] = Place(env_id, overrides, where)
+        places[env_id] = StudyEnvironment(env_id, overrides, where)
     if not places:
         raise section.error("must have at least one environment.")
     return places
 
 
-def _evaluation(section: Section) -> Evaluation:
+def _evaluation(section: Section) -> EvaluationPlan:
     chosen: dict[str, Any] = {}
     for key in section.mapping("settings of evaluations", _EVALUATION).value:
         own = section[key]
@@ -260,7 +260,7 @@ def _evaluation(section: Section) -> Evaluation:
         raise section[name].error(
             "has no use with online: true, with which nothing is played beside the training: leave it out."
         )
-    return Evaluation(**chosen)
+    return EvaluationPlan(**chosen)
 
 
 def _seeds(section: Section) -> tuple[int, ...]:
@@ -280,7 +280,7 @@ def _ablations(section: Section, arms: Mapping[str, Arm]) -> dict[str, tuple[str
     }
 
 
-def _excluded(section: Section, arms: Mapping[str, Arm], places: Mapping[str, Place]) -> frozenset[tuple[str, str]]:
+def _excluded(section: Section, arms: Mapping[str, Arm], places: Mapping[str, StudyEnvironment]) -> frozenset[tuple[str, str]]:
     pairs = set()
     for each in section.items("{arm: <label>, environment: <id>}"):
         keys = ("arm", "environment")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_belief.report.episodes import read_episodes_table, scores
-from sb3_belief.study.cell import BUSY, main
+from sb3_belief.study.cell import BUSY, cell_main
 from sb3_belief.study.final_evaluation import final_seed
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.errors import ConfigError
@@ -18,7 +18,7 @@ from tests.study.tiny import EASY, prepared, record
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     (cell,) = prepared(tmp_path_factory.mktemp("finished"))
-    assert main([str(cell.folder)]) == 0
+    assert cell_main([str(cell.folder)]) == 0
     return cell
 
 
@@ -65,7 +65,7 @@ def test_final_episodes_are_played_again_alike(finished, tmp_path):
     # As after a kill between the training and the final evaluations
     copy.write({**record(copy), "status": "running"})
     copy.episodes.unlink()
-    assert main([str(copy.folder)]) == 0
+    assert cell_main([str(copy.folder)]) == 0
     assert rows(copy) == before and record(copy)["attempts"] == 2
 
 
@@ -79,8 +79,8 @@ def test_final_episodes_have_seeds_of_their_own():
 def test_a_cell_that_is_held_is_left_alone(finished, capsys):
     before = record(finished)
     with run_lock(finished.folder):
-        assert main([str(finished.folder)]) == BUSY
-    assert main([str(finished.folder)]) == 0
+        assert cell_main([str(finished.folder)]) == BUSY
+    assert cell_main([str(finished.folder)]) == 0
     assert record(finished) == before
 
 
@@ -92,12 +92,12 @@ def test_a_failure_is_recorded_with_its_traceback(tmp_path, monkeypatch):
         raise RuntimeError("the environment is broken")
 
     monkeypatch.setattr(learning.SignalCheck, "_on_step", fail)
-    assert main([str(cell.folder)]) == 1
+    assert cell_main([str(cell.folder)]) == 1
     assert record(cell)["status"] == "failed" and "the environment is broken" in record(cell)["error"]
     assert "in fail" in (cell.folder / "error.txt").read_text()
     monkeypatch.undo()
     # Tried again it goes on, and forgets the error
-    assert main([str(cell.folder)]) == 0
+    assert cell_main([str(cell.folder)]) == 0
     assert record(cell)["status"] == "finished" and record(cell)["error"] is None
     assert not (cell.folder / "error.txt").exists()
 
@@ -110,7 +110,7 @@ def test_a_run_without_a_whole_checkpoint_begins_anew(finished, tmp_path):
     for path in (run / "checkpoints").iterdir():
         path.write_bytes(path.read_bytes()[:1000])
     copy.write({**record(copy), "status": "running"})
-    assert main([str(copy.folder)]) == 0
+    assert cell_main([str(copy.folder)]) == 0
     assert [path.name for path in (copy.folder / "ppo").iterdir()] == [f"{EASY}_1"]
     assert "resumed" not in json.loads((run / "run.json").read_text()) and rows(copy) == rows(finished)
 
@@ -121,7 +121,7 @@ def test_a_damaged_file_of_the_run_is_a_failure_that_says_which(finished, tmp_pa
     path = copy.folder / "ppo" / f"{EASY}_1" / "evaluations.npz"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     copy.write({**record(copy), "status": "running"})
-    assert main([str(copy.folder)]) == 1
+    assert cell_main([str(copy.folder)]) == 1
     assert f"{path} is damaged" in record(copy)["error"]
 
 
@@ -131,7 +131,7 @@ def test_half_a_record_is_refused(finished, tmp_path):
     copy.path.write_text(copy.path.read_text()[:100])
     with pytest.raises(ConfigError, match=r"cell.json: is damaged.*Move the folder"):
         copy.read()
-    assert main([str(copy.folder)]) == 1
+    assert cell_main([str(copy.folder)]) == 1
 
 
 def test_episodes_of_the_training_itself(tmp_path):
@@ -141,7 +141,7 @@ def test_episodes_of_the_training_itself(tmp_path):
     }
     online = {"online": True, "every": 160, "final_episodes": 12}
     (cell,) = prepared(tmp_path, **changes, evaluation=online, n_timesteps=480)
-    assert main([str(cell.folder)]) == 0
+    assert cell_main([str(cell.folder)]) == 0
     (run,) = (cell.folder / "ippo").iterdir()
     assert not (run / "evaluations.npz").exists()
     with open(run / "monitor.csv") as file:

@@ -42,7 +42,7 @@ def test_killed_three_times_it_ends_with_the_same_episodes(tmp_path, undisturbed
     # Another one each time, which a failure shows
     seed = random.randrange(10**6)
     rng = random.Random(seed)
-    moments = []
+    moments: list[float] = []
     for _ in range(3):
         process = start(*words)
         before = len(moments)

@@ -25,9 +25,9 @@ STATES = states(
 
 
 def shown(table):
-    console = Console(file=io.StringIO(), width=120)
-    console.print(table)
-    return console.file.getvalue()
+    file = io.StringIO()
+    Console(file=file, width=120).print(table)
+    return file.getvalue()
 
 
 def test_the_table_counts_cells_by_algorithm_and_environment():
@@ -78,11 +78,12 @@ def test_the_terminal_shows_the_table(tmp_path):
     cell = Cell(tmp_path / "cells" / "arm" / "env" / "seed_0")
     record = {"study": "s", "arm": "arm", "algo": "ppo", "env": "env", "seed": 0, "status": "failed", "attempts": 1}
     cell.create({**record, "n_timesteps": 1000, "final_episodes": 1, "options": {}, "settings": {}})
-    console = Console(file=io.StringIO(), force_terminal=True, width=100)
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=100)
     with StudyDisplay("s", [cell], 1, console) as display:
         display.tell("a line above")
         display.update()
-    assert "1 failed" in console.file.getvalue() and "a line above" in console.file.getvalue()
+    assert "1 failed" in file.getvalue() and "a line above" in file.getvalue()
 
 
 def test_progress_is_read_from_the_end_of_the_tables(tmp_path):

@@ -24,10 +24,10 @@ LONGER = {"seeds": 2, "n_timesteps": 4000, "evaluation": {**TINY["evaluation"], 
 def test_a_node_without_the_folder_says_so(tmp_path):
     (cell,) = prepared(tmp_path)
     folder = tmp_path / "logs" / "tiny"
-    assert "does not see the folder" in run_cell_in_task(str(cell.folder), str(folder), "token", ())
+    assert "does not see the folder" in str(run_cell_in_task(str(cell.folder), str(folder), "token", ()))
     # Another folder of the same path
     (folder / TOKEN_FILE).write_text("of another study")
-    assert "all nodes must share it" in run_cell_in_task(str(cell.folder), str(folder), "token", ())
+    assert "all nodes must share it" in str(run_cell_in_task(str(cell.folder), str(folder), "token", ()))
     assert record(cell)["attempts"] == 0
 
 

@@ -27,7 +27,7 @@ def in_process(monkeypatch):
         def poll(self):
             return self.returncode
 
-    monkeypatch.setattr(engine, "start_cell", lambda cell, packages, output: Done(cell_module.main([str(cell.folder)])))
+    monkeypatch.setattr(engine, "start_cell", lambda cell, packages, output: Done(cell_module.cell_main([str(cell.folder)])))
 
 
 def test_a_study_is_extended_and_a_change_refused(tmp_path, in_process, capsys):

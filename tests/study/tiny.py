@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -16,7 +17,7 @@ from sb3_belief.study.study_folder import planned_cells, prepare_folder
 
 EASY = "traffic-junction-easy"
 #: Five rollouts of 80 joint steps, and two evaluations
-TINY = {
+TINY: dict[str, Any] = {
     "name": "tiny",
     "environments": {EASY: {"n_envs": 4, "n_steps": 20, "batch_size": 40, "n_epochs": 1}},
     "algorithms": {"ippo": {"algo": "ppo", "params": {"policy": "MlpPolicy"}}},
