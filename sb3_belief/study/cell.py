@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_belief.common.durable_files import sweep_temporary_files
-from sb3_belief.study.cell_record import CELL_CONFIG, FAILED, FINISHED, RUNNING, WAITING, Cell
+from sb3_belief.study.cell_record import CELL_CONFIG, FAILED, FINISHED, FREE_OPTIONS, RUNNING, WAITING, Cell
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause
 from sb3_belief.zoo.run_lock import run_lock
 
@@ -140,7 +140,7 @@ def _train_and_evaluate(cell: Cell, record: dict[str, Any], extra_packages: tupl
 
 def _train(cell: Cell, record: dict[str, Any], config: Any, extra_packages: tuple[str, ...]) -> tuple[int, Path]:
     """Train the run of a cell, or go on with it. Return the exit status and its folder."""
-    from sb3_belief.zoo.continuation import Continuation, resume
+    from sb3_belief.zoo.continuation import NO_CHECKPOINT, Continuation, resume
     from sb3_belief.zoo.run_folder import read_record, whole_checkpoints
     from sb3_belief.zoo.train import train
     from sb3_belief.zoo.train_options import TrainOptions
@@ -151,11 +151,17 @@ def _train(cell: Cell, record: dict[str, Any], config: Any, extra_packages: tupl
         if read_record(run).get("status") == "finished":
             return 0, run
         if next(whole_checkpoints(run), None) is not None:
-            free = {name: record["options"][name] for name in ("device", "num_threads", "jobs", "on_nan", "save_every")}
-            result = resume(Continuation(str(run), None, free, extra_packages, command=command))
-            assert result is not None
-            return result.exit_status, run
-    # What has no whole checkpoint is begun anew, and is in the way of the folder's name
+            free = {name: record["options"][name] for name in FREE_OPTIONS}
+            try:
+                result = resume(Continuation(str(run), None, free, extra_packages, command=command))
+            except ConfigError as error:
+                # Some trainings cannot be continued exactly, and their checkpoints hold the models only
+                if NO_CHECKPOINT not in str(error):
+                    raise
+            else:
+                assert result is not None
+                return result.exit_status, run
+    # What has no checkpoint to go on from is begun anew, and is in the way of the folder's name
     shutil.rmtree(cell.folder / record["algo"], ignore_errors=True)
     options = TrainOptions(
         **record["options"],

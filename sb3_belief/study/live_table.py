@@ -88,7 +88,9 @@ class TimeLeft:
         if self._done_before is None:
             self._done_before = done
         elapsed = time.monotonic() - self._start
-        running = max(min(self._jobs, sum(each.status not in (FINISHED, FAILED) for each in states)), 1)
+        left = sum(each.status not in (FINISHED, FAILED) for each in states)
+        # Other processes and nodes may run some, too
+        running = max(min(self._jobs, left), sum(each.status == RUNNING for each in states), 1)
         # Of one process, as those of the finished cells are
         overall = (done - self._done_before) / elapsed / running if elapsed > 0 else 0.0
         known = [speed for each in speeds.values() for speed in each]

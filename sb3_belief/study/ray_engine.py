@@ -91,11 +91,12 @@ def _wait_for(
 
     waiting = [cell for cell in cells if cell.read()["status"] not in (FINISHED, FAILED)]
     tasks: dict[Any, Cell] = {}
+    remote = ray.remote(run_cell_in_task)
     while waiting or tasks:
         while waiting and (jobs is None or len(tasks) < jobs):
             cell = waiting.pop(0)
             options = cell.read()["options"]
-            task = ray.remote(run_cell_in_task).options(
+            task = remote.options(
                 name=f"{cell.name}",
                 num_cpus=max(options["jobs"], options["num_threads"], 1),
                 num_gpus=1 if str(options["device"]).startswith("cuda") else 0,

@@ -202,11 +202,9 @@ def load_study(path: Path) -> Study:
 def _arms(section: Section) -> dict[str, Arm]:
     arms: dict[str, Arm] = {}
     for name in section.mapping("a mapping of labels to {algo: <name>, params: {...}}").value:
-        own = section[name]
+        own = section[name].or_empty()
         if not _NAME.fullmatch(name):
             raise own.error("a label names a folder: letters, digits and any of . _ + - only.")
-        if own.value is None:
-            own = Section({}, own.file, own.keys, own._lines)
         own.mapping("{algo: <name>, params: {...}}", ("algo", "params"))
         if "algo" not in own and name not in ALGOS:
             raise own.error(f"has no key 'algo', and {name!r} is no algorithm: write algo: <one of {', '.join(ALGOS)}>.")

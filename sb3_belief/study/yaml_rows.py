@@ -47,6 +47,10 @@ class Section:
     def __contains__(self, key: Any) -> bool:
         return key in self.value
 
+    def or_empty(self) -> "Section":
+        """Return the section, as an empty mapping if nothing stands after its key."""
+        return Section({}, self.file, self.keys, self._lines) if self.value is None else self
+
     def mapping(self, what: str, allowed: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> "Section":
         """
         Check that the value is a mapping with known keys.

@@ -34,6 +34,9 @@ from sb3_belief.zoo.tracking import ENTRY, Tracking, check_tracking
 from sb3_belief.zoo.train import common_arguments, make_envs, track
 from sb3_belief.zoo.train_options import TrainOptions, TrainResult
 
+#: Words of the refusal to go on with a run of which no checkpoint can be loaded
+NO_CHECKPOINT = "no checkpoint of"
+
 
 @dataclass(frozen=True)
 class Continuation:
@@ -181,7 +184,7 @@ def _load_newest(
             why = f" {cause(error)}"
             print(f"{path} cannot be loaded ({cause(error)}): an earlier checkpoint is looked for.", file=sys.stderr)
     raise ConfigError(
-        f"--resume: no checkpoint of {folder} can be loaded.{why} A run that ended before its first one is begun anew; -i"
+        f"--resume: {NO_CHECKPOINT} {folder} can be loaded.{why} A run that ended before its first one is begun anew; -i"
         " trains the team of a zip further, in a new run."
     )
 

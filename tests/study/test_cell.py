@@ -156,3 +156,16 @@ def test_episodes_of_the_training_itself(tmp_path):
     assert [row["episode_return"] for row in final] == monitor[-12:]
     assert {(row["checkpoint"], row["deterministic"], row["joint_steps"]) for row in final} == {("last", False, 480)}
     assert {row["length"] for row in table} == {16} and {row["success"] for row in table} == {None}
+
+
+def test_a_run_that_cannot_be_continued_exactly_begins_anew(finished, tmp_path):
+    copy = type(finished)(tmp_path / "cell")
+    shutil.copytree(finished.folder, copy.folder)
+    run = copy.folder / "ppo" / f"{EASY}_1"
+    (run / "run.json").write_text((run / "run.json").read_text().replace('"finished"', '"running"'))
+    for path in (run / "checkpoints").iterdir():
+        # Whole, but without what an exact continuation needs
+        shutil.copyfile(run / "team.zip", path)
+    copy.write({**record(copy), "status": "running"})
+    assert cell_main([str(copy.folder)]) == 0
+    assert "resumed" not in json.loads((run / "run.json").read_text()) and rows(copy) == rows(finished)
