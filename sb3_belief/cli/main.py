@@ -1,4 +1,4 @@
-"""Command line: ``sb3-belief train | enjoy | watch | export | envs | demo``."""
+"""The command ``sb3-belief`` with all its commands, and the script ``train.py``."""
 
 import argparse
 import os
@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sb3_belief.cli import demo, enjoy, envs, export, train, watch
+from sb3_belief.cli import demo, enjoy, envs, export, load, push, study, train, tune, watch
 from sb3_belief.cli.flags import STYLE, Parser
 from sb3_belief.zoo.errors import ConfigError, RunFailed
 
 _EXIT_STATUS = """\
 exit status:
   0    done; with --resume also if the run has finished already
-  1    the training failed, or an environment failed its check
+  1    the training or a run of a study failed, or an environment failed its check
   2    a setting was refused, and nothing was written
   129  SIGHUP ended the training, and the last good state was saved
   130  Ctrl-C (SIGINT), likewise
@@ -30,7 +30,18 @@ _OF_THE_WHOLE_PACKAGE = {"greenlet", "pettingzoo", "sb3_contrib", "supersuit"}
 _CLOSED_PIPE = 141
 
 #: The commands: what their help says, their flags, and what they do
-COMMANDS = {"train": train, "enjoy": enjoy, "watch": watch, "export": export, "envs": envs, "demo": demo}
+COMMANDS = {
+    "train": train,
+    "enjoy": enjoy,
+    "watch": watch,
+    "study": study,
+    "tune": tune,
+    "export": export,
+    "push": push,
+    "load": load,
+    "envs": envs,
+    "demo": demo,
+}
 
 
 class _Version(argparse.Action):
