@@ -144,7 +144,11 @@ def test_the_intervals_are_those_of_the_episodes(tmp_path):
     successes = np.zeros((2, 400), dtype=bool)
     successes[1, :100] = True
     np.savez(tmp_path / "evaluations.npz", timesteps=[10, 20], results=results, successes=successes)
-    last, best = run_scores(tmp_path)
+    scores = run_scores(tmp_path)
+    assert scores is not None
+    last, best = scores
+    assert last.success is not None and best.success is not None
+    assert last.returns.low is not None and last.returns.high is not None and best.success.high is not None
     assert (last.joint_steps, best.joint_steps, last.n_episodes) == (20, 10, 400)
     # For so many episodes, that of the normal distribution
     half = stats.norm.ppf(0.975) * results[1].std() / 20

@@ -75,7 +75,9 @@ def test_teams_that_found_no_other_place_are_no_leftovers(tmp_path):
 def test_growth_counts_from_a_moment_on():
     # Grows fast, then by a tenth within the hour
     samples = [(60.0 * minute, 100.0 + 10 * min(minute, 10) + 0.4 * max(minute - 10, 0)) for minute in range(61)]
-    first, last, grown = growth(samples, after=600.0)
+    found = growth(samples, after=600.0)
+    assert found is not None
+    first, last, grown = found
     # Medians of minutes 10 to 14 and 56 to 60
     assert first == pytest.approx(200.8) and last == pytest.approx(219.2)
     assert grown == pytest.approx(last / first - 1)

@@ -165,6 +165,7 @@ def test_a_trial_is_begun_three_times_at_most(tmp_path):
     drawn = []
     for _ in range(3):
         trial = storage.draw()
+        assert trial is not None
         storage.trial_folder(trial.number).mkdir(parents=True)
         with run_lock(storage.trial_folder(trial.number)):
             storage.give_up_killed()  # it is held

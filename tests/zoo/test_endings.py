@@ -362,7 +362,7 @@ def test_what_is_saved_elsewhere_takes_no_other_files_place(tmp_path, monkeypatc
             place.write_text(content)
 
         saved = save_somewhere(tmp_path / folder / "ppo" / "game_1" / "team.zip", write)
-        assert saved == elsewhere / names[-1] and saved.read_text() == folder
+        assert saved == elsewhere / names[-1] and (elsewhere / names[-1]).read_text() == folder
         assert sorted(path.name for path in elsewhere.iterdir()) == names
         assert f"saved as {saved} instead" in capfd.readouterr().err
     # Nothing is left where it could not be written

@@ -55,7 +55,7 @@ def fake(monkeypatch):
 
 def logged(path, last=None):
     """The rows of a table as a tracker gets them, by step: numbers only, without what TensorBoard does not get."""
-    rows = {}
+    rows: dict[int, dict[str, float]] = {}
     for row in table(path):
         step = int(row["time/total_timesteps"])
         values = {key: float(text) for key, text in row.items() if text and key not in EXCLUDED and key != "time/fps"}
@@ -65,7 +65,7 @@ def logged(path, last=None):
 
 
 def tracked(rows, prefix=""):
-    found = {}
+    found: dict = {}
     for step, values in rows:
         for key, value in values.items():
             name = key.removeprefix(prefix)
