@@ -1,0 +1,146 @@
+"""Runs without a study: which of them compare, and the table of the episodes of their evaluations."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from sb3_belief.report.episodes import EPISODES
+from sb3_belief.study.reported import Reported, ReportedRun
+from sb3_belief.study.run_reading import RunData, read_run, run_folders
+from sb3_belief.zoo.errors import ConfigError, cause, short
+
+_EVALUATIONS = "evaluations.npz"
+
+
+def reported_logs(folder: Path) -> Reported:
+    """
+    Read the runs in a folder.
+
+    Runs of one algorithm with the same settings in an environment are one group, over seeds; where settings differ, they are
+    part of the group's name. Of finished runs with the same seed the newest counts.
+
+    :param folder: The folder
+    :return: What can be reported of them
+    :raises ConfigError: If there is no run
+    """
+    data = [read_run(path) for path in run_folders(folder)]
+    if not data:
+        raise ConfigError(f"{short(str(folder))}: holds no run and no study: give the folder of a study, or one with runs.")
+    labels = _labels(data)
+    runs = [ReportedRun(each, label, why_not=_why_not(each)) for each, label in zip(data, labels, strict=True)]
+    rows: list[dict[str, Any]] = []
+    newest = _newest(runs)
+    for index, run in enumerate(runs):
+        if not run.why_not and newest[run.arm, run.data.env, run.data.seed] is not run:
+            runs[index] = replace(run, why_not="a newer run has the same settings and seed")
+        elif not run.why_not:
+            try:
+                own = list(_rows(run, folder.name))
+            except ValueError as error:
+                own, why = [], str(error)
+            else:
+                why = "never evaluated"
+            rows += own
+            if not own:
+                runs[index] = replace(run, why_not=why)
+    arms = list(dict.fromkeys(run.arm for run in sorted(runs, key=lambda run: run.arm)))
+    counted = [run.data for run in runs if not run.why_not]
+    return Reported(
+        name=folder.resolve().name or "runs",
+        folder=folder,
+        is_study=False,
+        arms=arms,
+        baseline=next((arm for arm in arms if arm.split(" ")[0] == "ippo"), None),
+        runs=runs,
+        table=pa.Table.from_pylist(rows, schema=EPISODES),
+        evaluation_every=_common(counted, "eval_freq"),
+        evaluation_episodes=_common(counted, "eval_episodes"),
+    )
+
+
+def _why_not(run: RunData) -> str:
+    if run.status != "finished":
+        return run.status
+    if run.record.get("start_timesteps"):
+        return "continues the training of another run"
+    return "" if run.seed is not None else "its record has no seed"
+
+
+def _newest(runs: Sequence[ReportedRun]) -> dict[tuple[str, str, int | None], ReportedRun]:
+    """Return the newest finished run of each group and seed."""
+    found: dict[tuple[str, str, int | None], ReportedRun] = {}
+    for run in sorted((run for run in runs if not run.why_not), key=lambda run: str(run.data.record.get("started", ""))):
+        found[run.arm, run.data.env, run.data.seed] = run
+    return found
+
+
+def _labels(runs: Sequence[RunData]) -> list[str]:
+    """Return the name of each run's group: its algorithm, its belief, and the settings in which the runs differ."""
+    flat = [dict(_flat(run.settings)) for run in runs]
+    differing: dict[str, dict[str, None]] = {}
+    for run, settings in zip(runs, flat, strict=True):
+        names = differing.setdefault(run.algo, {})
+        for other, theirs in zip(runs, flat, strict=True):
+            # A damaged configuration says nothing
+            if settings and theirs and (other.algo, other.env) == (run.algo, run.env):
+                names.update(dict.fromkeys(key for key in [*settings, *theirs] if settings.get(key) != theirs.get(key)))
+    labels = []
+    for run, settings in zip(runs, flat, strict=True):
+        named = [key for key in differing[run.algo] if key in settings and key != "belief"]
+        words = [str(settings["belief"])] if "belief" in settings else []
+        words += [f"{key}={settings[key]}" for key in named]
+        labels.append(f"{run.algo} ({', '.join(words)})" if words else run.algo)
+    return labels
+
+
+def _flat(settings: dict[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", str(value)
+
+
+def _rows(run: ReportedRun, study: str) -> Iterator[dict[str, Any]]:
+    """Iterate over the episodes of a run's evaluations."""
+    path = run.data.folder / _EVALUATIONS
+    if not path.is_file():
+        return
+    try:
+        with np.load(path) as data:
+            steps, returns, lengths = data["timesteps"], data["results"], data["ep_lengths"]
+            successes = data["successes"] if "successes" in data else None
+    # A damaged file makes zipfile and numpy raise whatever they raise
+    except Exception as error:
+        raise ValueError(f"its {_EVALUATIONS} is damaged ({cause(error)})") from error
+    for index, joint_steps in enumerate(steps):
+        won = (
+            None if successes is None or len(successes) <= index or len(successes[index]) != len(returns[index]) else successes
+        )
+        for episode, value in enumerate(returns[index]):
+            yield {
+                "study": study,
+                "arm": run.arm,
+                "algorithm": run.data.algo,
+                "environment": run.data.env,
+                "seed": run.data.seed,
+                "phase": "training",
+                "checkpoint": "current",
+                "deterministic": True,
+                "joint_steps": int(joint_steps),
+                "episode": episode,
+                "episode_return": float(value),
+                "success": None if won is None else float(won[index][episode]),
+                "length": int(lengths[index][episode]),
+            }
+
+
+def _common(runs: Sequence[RunData], option: str) -> int | None:
+    """Return an option of the runs, or None if they differ or do not say."""
+    values = {run.record.get("options", {}).get(option) for run in runs}
+    value = values.pop() if len(values) == 1 else None
+    return value if isinstance(value, int) else None

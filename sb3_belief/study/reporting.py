@@ -1,0 +1,161 @@
+"""The report of a study or of a folder of runs: a page, a page for each run, and all figures and tables as files."""
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from sb3_belief.common.durable_files import make_folder, replaced_file
+from sb3_belief.common.versions import __version__
+from sb3_belief.report.episodes import write_episodes_table
+from sb3_belief.report.figures.drawing import check_drawing, vega_bundle
+from sb3_belief.report.page.content import Page
+from sb3_belief.report.page.files import files_folder, write_page
+from sb3_belief.report.page.render import render_page
+from sb3_belief.report.study_page.facts import RunFacts, StudyFacts
+from sb3_belief.report.study_page.findings import Findings, default_quantity, find
+from sb3_belief.report.study_page.run_page import run_page
+from sb3_belief.report.study_page.runs import run_names
+from sb3_belief.report.study_page.sections import StudyPage
+from sb3_belief.study.reported import Reported, ReportedRun
+from sb3_belief.study.reported_logs import reported_logs
+from sb3_belief.study.reported_study import EPISODES_FILE, is_study, reported_study
+from sb3_belief.study.run_reading import diagnostic_series, evaluation_series
+from sb3_belief.zoo.errors import ConfigError, reason_of, short, unknown_setting
+
+RUNS, BUNDLE, VIEWER = "runs", "vega.js", "viewer.html"
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """
+    Options of a report.
+
+    :param source: Folder of a study, or of runs
+    :param output: HTML file to write. None for ``report.html`` in that folder
+    :param quantity: ``"return"`` or ``"success"``. None for successes if all environments report them
+    :param baseline: The arm that the others are compared with. None for that of the study, or ``ippo``
+    """
+
+    source: str
+    output: str | None = None
+    quantity: str | None = None
+    baseline: str | None = None
+
+
+def write_report(options: ReportOptions) -> tuple[Path, Findings]:
+    """
+    Write the report of a study, or of the runs in a folder.
+
+    :param options: The options
+    :return: The page, and what it says
+    :raises ConfigError: If there is nothing to report, an option does not fit, or the page cannot be written
+    """
+    source = Path(options.source)
+    if not os.path.isdir(source):
+        raise ConfigError(f"report: no folder {short(options.source)}: give the folder of a study, or one with runs.")
+    output = source / "report.html" if options.output is None else Path(options.output)
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"-o: {short(str(output))} must end in .html.")
+    check_drawing()
+    try:
+        make_folder(output.parent)
+    except OSError as error:
+        raise ConfigError(f"-o: cannot make the folder {short(str(output.parent))} ({reason_of(error)}).") from None
+    reported = reported_study(source) if is_study(source) else reported_logs(source)
+    baseline = _baseline(reported, options.baseline)
+    quantity = options.quantity or default_quantity(reported.table)
+    try:
+        findings = find(reported.table, reported.arms, baseline, quantity)
+    except ValueError as error:
+        raise ConfigError(f"report: {error}") from None
+    facts = _facts(reported, findings)
+    try:
+        if reported.is_study and reported.table.num_rows:
+            write_episodes_table(reported.table, source / EPISODES_FILE)
+        _write(facts, findings, output)
+    except OSError as error:
+        raise ConfigError(f"-o: cannot write {short(str(output))} ({reason_of(error)}).") from None
+    return output, findings
+
+
+def _baseline(reported: Reported, given: str | None) -> str | None:
+    if given is None:
+        return reported.baseline
+    if given not in reported.arms:
+        raise unknown_setting("--baseline", "algorithm", given, reported.arms)
+    return given
+
+
+def _facts(reported: Reported, findings: Findings) -> StudyFacts:
+    scores = {
+        (environment, arm): found.seeds for environment, arms in findings.environments.items() for arm, found in arms.items()
+    }
+    return StudyFacts(
+        name=reported.name,
+        runs=[
+            _run_facts(run, reported.folder, findings.quantity, scores.get((run.data.env, run.arm), {}))
+            for run in reported.runs
+        ],
+        is_study=reported.is_study,
+        evaluation_every=reported.evaluation_every,
+        evaluation_episodes=reported.evaluation_episodes,
+        final_episodes=reported.final_episodes,
+        ablations=reported.ablations,
+        notices=reported.notices,
+    )
+
+
+def _run_facts(run: ReportedRun, source: Path, quantity: str, scores: Mapping[int | str, float]) -> RunFacts:
+    data = run.data
+    versions, seconds = data.record.get("versions"), data.record.get("seconds")
+    viewer = data.folder / VIEWER
+    has_score = not run.why_not and data.seed is not None
+    return RunFacts(
+        arm=run.arm,
+        algorithm=data.algo,
+        environment=data.env,
+        seed=data.seed,
+        status=data.status,
+        folder=Path(os.path.relpath(data.folder, source)),
+        counts=not run.why_not,
+        why_not=run.why_not,
+        joint_steps=data.joint_steps,
+        total_steps=data.total_steps,
+        seconds=float(seconds) if isinstance(seconds, int | float) else None,
+        started=str(data.record.get("started", "")),
+        command=str(data.record.get("command", "")),
+        config=yaml.safe_dump({data.env: data.settings}, sort_keys=False, allow_unicode=True) if data.settings else "",
+        versions={str(name): str(version) for name, version in versions.items()} if isinstance(versions, dict) else {},
+        error=run.error or data.error,
+        score=scores.get(data.seed) if has_score and data.seed is not None else None,
+        evaluations=evaluation_series(data.folder, quantity),
+        diagnostics=diagnostic_series(data.folder),
+        viewer=viewer.resolve() if viewer.is_file() else None,
+    )
+
+
+def _write(facts: StudyFacts, findings: Findings, output: Path) -> None:
+    made = f"Made {time.strftime('%Y-%m-%d %H:%M %z')} by sb3-belief {__version__}."
+    files = files_folder(output)
+    bundle = vega_bundle()
+    runs = make_folder(files / RUNS)
+    with replaced_file(files / BUNDLE, "w", encoding="utf-8") as file:
+        file.write(bundle)
+    pages: dict[str, str] = {}
+    for run, name in zip(facts.runs, run_names(facts.runs), strict=True):
+        path = runs / f"{name}.html"
+        viewer = None if run.viewer is None else os.path.relpath(run.viewer, runs.resolve())
+        _write_run_page(run_page(run, findings.unit, (f"../../{output.name}", facts.name), made, viewer), path)
+        pages[str(run.folder)] = f"{files.name}/{RUNS}/{path.name}"
+    write_page(StudyPage(facts, findings, made, pages).page(), output, bundle)
+
+
+def _write_run_page(page: Page, path: Path) -> None:
+    # They share one script, which is as large as all else of many pages
+    text = render_page(page, None, bundle_file=f"../{BUNDLE}")
+    with replaced_file(path, "w", encoding="utf-8") as file:
+        file.write(text)
