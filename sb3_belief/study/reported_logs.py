@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from sb3_belief.report.episodes import EPISODES
+from sb3_belief.study.groups import labels
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.run_reading import RunData, read_run, run_folders
 from sb3_belief.zoo.errors import ConfigError, cause, short
@@ -30,8 +31,8 @@ def reported_logs(folder: Path) -> Reported:
     data = [read_run(path) for path in run_folders(folder)]
     if not data:
         raise ConfigError(f"{short(str(folder))}: holds no run and no study: give the folder of a study, or one with runs.")
-    labels = _labels(data)
-    runs = [ReportedRun(each, label, why_not=_why_not(each)) for each, label in zip(data, labels, strict=True)]
+    names = labels(data)
+    runs = [ReportedRun(each, label, why_not=_why_not(each)) for each, label in zip(data, names, strict=True)]
     rows: list[dict[str, Any]] = []
     newest = _newest(runs)
     for index, run in enumerate(runs):
@@ -76,33 +77,6 @@ def _newest(runs: Sequence[ReportedRun]) -> dict[tuple[str, str, int | None], Re
     for run in sorted((run for run in runs if not run.why_not), key=lambda run: str(run.data.record.get("started", ""))):
         found[run.arm, run.data.env, run.data.seed] = run
     return found
-
-
-def _labels(runs: Sequence[RunData]) -> list[str]:
-    """Return the name of each run's group: its algorithm, its belief, and the settings in which the runs differ."""
-    flat = [dict(_flat(run.settings)) for run in runs]
-    differing: dict[str, dict[str, None]] = {}
-    for run, settings in zip(runs, flat, strict=True):
-        names = differing.setdefault(run.algo, {})
-        for other, theirs in zip(runs, flat, strict=True):
-            # A damaged configuration says nothing
-            if settings and theirs and (other.algo, other.env) == (run.algo, run.env):
-                names.update(dict.fromkeys(key for key in [*settings, *theirs] if settings.get(key) != theirs.get(key)))
-    labels = []
-    for run, settings in zip(runs, flat, strict=True):
-        named = [key for key in differing[run.algo] if key in settings and key != "belief"]
-        words = [str(settings["belief"])] if "belief" in settings else []
-        words += [f"{key}={settings[key]}" for key in named]
-        labels.append(f"{run.algo} ({', '.join(words)})" if words else run.algo)
-    return labels
-
-
-def _flat(settings: dict[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{before}{key}.")
-        else:
-            yield f"{before}{key}", str(value)
 
 
 def _rows(run: ReportedRun, study: str) -> Iterator[dict[str, Any]]:

@@ -20,6 +20,7 @@ from sb3_belief.report.study_page.findings import Findings, default_quantity, fi
 from sb3_belief.report.study_page.run_page import run_page
 from sb3_belief.report.study_page.runs import run_names
 from sb3_belief.report.study_page.sections import StudyPage
+from sb3_belief.report.study_page.text import result_sentences
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.reported_logs import reported_logs
 from sb3_belief.study.reported_study import EPISODES_FILE, is_study, reported_study
@@ -46,12 +47,12 @@ class ReportOptions:
     baseline: str | None = None
 
 
-def write_report(options: ReportOptions) -> tuple[Path, Findings]:
+def write_report(options: ReportOptions) -> tuple[Path, str]:
     """
     Write the report of a study, or of the runs in a folder.
 
     :param options: The options
-    :return: The page, and what it says
+    :return: The page, and what was found, in a few sentences
     :raises ConfigError: If there is nothing to report, an option does not fit, or the page cannot be written
     """
     source = Path(options.source)
@@ -61,12 +62,13 @@ def write_report(options: ReportOptions) -> tuple[Path, Findings]:
     if output.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"-o: {short(str(output))} must end in .html.")
     check_drawing()
-    try:
-        make_folder(output.parent)
-    except OSError as error:
-        raise ConfigError(f"-o: cannot make the folder {short(str(output.parent))} ({reason_of(error)}).") from None
     reported = reported_study(source) if is_study(source) else reported_logs(source)
     baseline = _baseline(reported, options.baseline)
+    try:
+        # Before the work, not after it
+        make_folder(files_folder(output) / RUNS)
+    except OSError as error:
+        raise ConfigError(f"-o: cannot make the folder {short(str(files_folder(output)))} ({reason_of(error)}).") from None
     quantity = options.quantity or default_quantity(reported.table)
     try:
         findings = find(reported.table, reported.arms, baseline, quantity)
@@ -79,7 +81,7 @@ def write_report(options: ReportOptions) -> tuple[Path, Findings]:
         _write(facts, findings, output)
     except OSError as error:
         raise ConfigError(f"-o: cannot write {short(str(output))} ({reason_of(error)}).") from None
-    return output, findings
+    return output, result_sentences(findings)
 
 
 def _baseline(reported: Reported, given: str | None) -> str | None:
@@ -142,7 +144,7 @@ def _write(facts: StudyFacts, findings: Findings, output: Path) -> None:
     made = f"Made {time.strftime('%Y-%m-%d %H:%M %z')} by sb3-belief {__version__}."
     files = files_folder(output)
     bundle = vega_bundle()
-    runs = make_folder(files / RUNS)
+    runs = files / RUNS
     with replaced_file(files / BUNDLE, "w", encoding="utf-8") as file:
         file.write(bundle)
     pages: dict[str, str] = {}

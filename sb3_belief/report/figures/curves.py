@@ -10,7 +10,7 @@ import numpy as np
 from sb3_belief.report.figures.theme import SCHEMA
 
 # In figures beside each other; a page makes them as wide as their place
-WIDTH, HEIGHT = 420, 250
+WIDTH, HEIGHT = 420, 220
 _SHOWN = "indexof(hidden, datum.arm) < 0"
 
 

@@ -24,14 +24,14 @@ def figure_svg(spec: Mapping[str, Any]) -> str:
     return svg
 
 
-def figure_png(spec: Mapping[str, Any]) -> bytes:
+def figure_png(svg: str) -> bytes:
     """
     Draw a figure as a PNG file.
 
-    :param spec: The figure
+    :param svg: Text of its SVG file
     :return: Content of the file
     """
-    png: bytes = _vl_convert().vegalite_to_png(in_file(spec), scale=_SCALE)
+    png: bytes = _vl_convert().svg_to_png(svg, scale=_SCALE)
     return png
 
 
@@ -43,7 +43,7 @@ def still_svg(spec: Mapping[str, Any]) -> str:
     :return: Element ``svg``, as wide as its place, with the page's CSS variables for colours
     """
     figure = still(on_page(spec))
-    figure.update(width=_WIDTH_ON_PAGE)
+    figure["width"] = _WIDTH_ON_PAGE
     svg: str = _vl_convert().vegalite_to_svg(figure)
     # The element's size is that of its place. What it shows is said by the element around it
     svg = re.sub(r'^(<svg [^>]*?) width="[\d.]+" height="[\d.]+"', r"\1", svg)

@@ -7,7 +7,7 @@ from typing import Any
 from sb3_belief.report.figures.curves import WIDTH, rounded
 from sb3_belief.report.figures.theme import SCHEMA
 
-_ROW = 30
+_ROW = 28
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def intervals_spec(
                 "name": "interval",
                 "data": {"name": "estimates"},
                 "transform": [*shown, {"filter": "isValid(datum.low)"}],
-                "mark": {"type": "rule", "strokeWidth": 7, "opacity": 0.35, "strokeCap": "round"},
+                "mark": {"type": "rule", "clip": True, "strokeWidth": 7, "opacity": 0.35, "strokeCap": "round"},
                 "encoding": {"x": x("low"), "x2": {"field": "high"}, "y": y, "color": color},
             }
         )

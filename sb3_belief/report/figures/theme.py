@@ -121,7 +121,7 @@ def on_page(spec: Mapping[str, Any]) -> dict[str, Any]:
     """
     figure = copy.deepcopy(dict(spec))
     figure.pop("title", None)
-    figure.update(width="container", autosize={"type": "fit", "contains": "padding"}, config=config())
+    figure.update(width="container", autosize={"type": "fit-x", "contains": "padding"}, config=config())
     _without_legends(figure)
     return figure
 

@@ -27,6 +27,7 @@ class Column:
         ``"link"`` a pair (text, relative address)
     :param digits: Decimals of numbers
     :param help: What the column means, shown when the pointer rests on the header
+    :param shown: Whether the page has it. Otherwise only the CSV file does
     """
 
     key: str
@@ -34,6 +35,7 @@ class Column:
     kind: Kind = "text"
     digits: int = 3
     help: str = ""
+    shown: bool = True
 
     def csv_names(self) -> list[str]:
         """
@@ -106,6 +108,14 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Mapping[str, Any]]
 
+    def shown(self) -> list[Column]:
+        """
+        Return the columns that the page has.
+
+        :return: The columns
+        """
+        return [column for column in self.columns if column.shown]
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -150,7 +160,8 @@ class Page:
 
     :param title: Title
     :param subtitle: What kind of page it is, above the title
-    :param summary: Paragraphs at the top, of which the first one can be copied
+    :param lead: What was found, at the top, in larger letters
+    :param quote: How it was found, in a paragraph that can be copied
     :param notices: What the reader must know first, such as runs that failed
     :param sections: The sections
     :param arms: Algorithms that the figures compare, with the colour of each (see ``figures.theme``)
@@ -160,8 +171,9 @@ class Page:
 
     title: str
     subtitle: str
-    summary: Sequence[str]
+    lead: str
     sections: Sequence[Section]
+    quote: str = ""
     notices: Sequence[str] = ()
     arms: Mapping[str, str] = field(default_factory=dict)
     footer: str = ""
@@ -201,8 +213,10 @@ def number_text(value: float, digits: int = 3) -> str:
     if not math.isfinite(value):
         return NOTHING
     size = abs(value)
-    if size >= 1e6 or 0 < size < 10 ** (-digits - 1):
+    if size >= 1e6:
         text = f"{value:.3g}"
+    elif 0 < size < 0.5 * 10**-digits:
+        text = f"{value:.1g}"
     else:
         text = f"{value:.{max(digits - max(int(math.log10(size)) if size >= 1 else 0, 0), 0)}f}"
     return text.replace("-", _MINUS)

@@ -13,6 +13,9 @@ from sb3_belief.report.figures.theme import in_file
 from sb3_belief.report.page.content import Page, Table
 from sb3_belief.report.page.render import FIGURES, TABLES, render_page
 
+#: Suffixes of the files of figures
+FIGURE_FORMATS = (".svg", ".png")
+
 
 def write_page(page: Page, path: str | os.PathLike[str], bundle: str) -> Path:
     """
@@ -33,8 +36,8 @@ def write_page(page: Page, path: str | os.PathLike[str], bundle: str) -> Path:
     for folder in (target.parent, files / FIGURES, files / TABLES):
         make_folder(folder)
     for figure in page.figures():
-        write_figure(figure.spec, files / FIGURES / f"{figure.name}.svg")
-        write_figure(figure.spec, files / FIGURES / f"{figure.name}.png")
+        paths = [files / FIGURES / f"{figure.name}{suffix}" for suffix in (".svg", ".png")]
+        write_figure(figure.spec, *paths)
         with replaced_file(files / FIGURES / f"{figure.name}.vl.json", "w", encoding="utf-8") as file:
             json.dump(in_file(figure.spec), file, allow_nan=False)
     for table in page.tables():
@@ -54,22 +57,21 @@ def files_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}_files")
 
 
-def write_figure(spec: Mapping[str, Any], path: Path) -> None:
+def write_figure(spec: Mapping[str, Any], *paths: Path) -> None:
     """
-    Write a figure into a file.
+    Write a figure into one file or several.
 
     :param spec: The figure
-    :param path: The file, whose suffix is ``.svg`` or ``.png``
+    :param paths: The files, whose suffixes are ``.svg`` or ``.png``
     :raises ValueError: For another suffix
     """
-    if path.suffix == ".svg":
-        content = figure_svg(spec).encode()
-    elif path.suffix == ".png":
-        content = figure_png(spec)
-    else:
-        raise ValueError(f"{path}: a figure's file ends in .png or .svg, not {path.suffix!r}.")
-    with replaced_file(path) as file:
-        file.write(content)
+    for path in paths:
+        if path.suffix.lower() not in FIGURE_FORMATS:
+            raise ValueError(f"{path}: a figure's file ends in {' or '.join(FIGURE_FORMATS)}.")
+    svg = figure_svg(spec)
+    for path in paths:
+        with replaced_file(path) as file:
+            file.write(figure_png(svg) if path.suffix.lower() == ".png" else svg.encode())
 
 
 def write_table(table: Table, path: Path) -> None:

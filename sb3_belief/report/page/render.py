@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from sb3_belief.report.figures.drawing import still_svg
 from sb3_belief.report.figures.theme import DARK, FONT, LIGHT, css_variables, on_page
-from sb3_belief.report.page.content import Column, Figure, Page, Section, Table
+from sb3_belief.report.page.content import NOTHING, Column, Figure, Page, Section, Table
 from sb3_belief.report.page.markup import Html, json_script, markup_of, script_of, tag
 
 _STATIC = Path(__file__).parent / "static"
@@ -101,10 +101,10 @@ def _header(page: Page) -> Html:
     if page.notices:
         notices = [tag("li", notice) for notice in page.notices]
         parts.append(tag("div", tag("strong", "Read this first"), tag("ul", *notices), class_="notice", role="note"))
-    for index, paragraph in enumerate(page.summary):
-        parts.append(tag("p", paragraph, class_="lead" if index == 0 else None, id="quote" if index == 0 else None))
-        if index == 0:
-            parts.append(tag("p", tag("button", "Copy", type="button", id="copy", class_="plain")))
+    parts += [tag("p", paragraph, class_="lead") for paragraph in page.lead.split("\n")]
+    if page.quote:
+        parts.append(tag("p", page.quote, class_="quote", id="quote"))
+        parts.append(tag("p", tag("button", "Copy this paragraph", type="button", id="copy", class_="plain")))
     return tag("header", *parts)
 
 
@@ -189,14 +189,14 @@ def _table(table: Table, page: Page, files: str | None) -> Html:
             class_="right" if column.kind in _NUMBERS else None,
             data_numeric=column.kind in _NUMBERS,
         )
-        for column in table.columns
+        for column in table.shown()
     ]
     rows = [
-        tag("tr", *(_cell(table, index, row, page) for index in range(len(table.columns))), role="row") for row in table.rows
+        tag("tr", *(_cell(table, index, row, page) for index in range(len(table.shown()))), role="row") for row in table.rows
     ]
     options = [
         tag("option", f"{column.label} {arrow}", value=f"{index} {direction}")
-        for index, column in enumerate(table.columns)
+        for index, column in enumerate(table.shown())
         for direction, arrow in ((1, "↑"), (-1, "↓"))
     ]
     name = f"Filter: {table.caption}"
@@ -207,19 +207,22 @@ def _table(table: Table, page: Page, files: str | None) -> Html:
     ]
     if files is not None:
         tools.append(tag("a", "CSV", href=_address(f"{files}/{TABLES}/{table.name}.csv")))
+    label = f"{table.name}-caption"
     element = tag(
         "table",
-        tag("caption", table.caption),
         tag("thead", tag("tr", *heads, role="row"), role="rowgroup"),
         tag("tbody", *rows, role="rowgroup"),
         class_="stacks",
         role="table",
+        aria_labelledby=label,
     )
-    return tag("div", tag("div", *tools, class_="tools"), tag("div", element, class_="scroll"), class_="table", id=table.name)
+    heading = tag("p", table.caption, class_="caption", id=label)
+    scroll = tag("div", element, class_="scroll")
+    return tag("div", heading, tag("div", *tools, class_="tools"), scroll, class_="table", id=table.name)
 
 
 def _cell(table: Table, index: int, row: Mapping[str, Any], page: Page) -> Html:
-    column: Column = table.columns[index]
+    column: Column = table.shown()[index]
     value = row.get(column.key)
     text, key = column.text(value), column.sort_key(value)
     content: object = text
@@ -229,11 +232,15 @@ def _cell(table: Table, index: int, row: Mapping[str, Any], page: Page) -> Html:
         # "better" in "better (significant)" is the class
         content = tag("span", text, class_=f"{column.kind} {text.split()[0]}")
     elif column.key == "arm" and text in page.arms:
-        content = markup_of(tag("span", class_="swatch", style=f"background:{page.arms[text]}", aria_hidden="true"), text)
+        content = tag("span", _swatch(page.arms[text]), text, class_="keep")
     classes = "right keep" if column.kind in _NUMBERS else None
     if index == 0:
         return tag("th", content, scope="row", role="rowheader", data_key=key, class_=classes)
-    return tag("td", content, role="cell", data_key=key, data_label=column.label, class_=classes)
+    return tag("td", content, role="cell", data_key=key, data_label=column.label, data_empty=text == NOTHING, class_=classes)
+
+
+def _swatch(colour: str) -> Html:
+    return tag("span", class_="swatch", style=f"background:{colour}", aria_hidden="true")
 
 
 def _address(path: str) -> str:

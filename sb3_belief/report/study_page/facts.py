@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.report.figures.curves import Curve
+
 #: The diagnostics of a belief that pages show, with their titles and what they say
 DIAGNOSTICS = {
     "belief/accuracy": ("Accuracy of the belief", "share of the others' actions that the belief expected most"),
@@ -149,3 +151,19 @@ def mean_of(series: Mapping[Any, Series]) -> Series:
         row[np.searchsorted(steps, own)] = values
     counts = (~np.isnan(rows)).sum(axis=0)
     return steps, np.nansum(rows, axis=0) / np.maximum(counts, 1)
+
+
+def curve_of(series: Mapping[int | str, Series]) -> Curve:
+    """
+    Return the curve of several series: their mean, each a thin line.
+
+    :param series: {seed or other name: steps and values}
+    :return: The curve
+    """
+    steps, means = mean_of(series)
+    seeds = {}
+    for name, (own, values) in series.items():
+        row = np.full(len(steps), np.nan)
+        row[np.searchsorted(steps, own)] = values
+        seeds[name] = row
+    return Curve(steps, means, seeds=seeds if len(series) > 1 else {})

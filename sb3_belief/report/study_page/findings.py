@@ -95,7 +95,7 @@ class Findings:
     @property
     def unit(self) -> str:
         """What a score is, in words."""
-        return "success rate" if self.quantity == "success" else "team return per episode"
+        return "success rate" if self.quantity == "success" else "return per episode"
 
 
 def find(

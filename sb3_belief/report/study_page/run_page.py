@@ -7,8 +7,7 @@ from sb3_belief.report.figures.curves import Curve, curves_spec
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
 from sb3_belief.report.page.content import Column, Figure, Page, Section, Table, number_text, unique_name
 from sb3_belief.report.page.markup import tag
-from sb3_belief.report.study_page.facts import DIAGNOSTICS, RunFacts, thinned
-from sb3_belief.report.study_page.sections import curve_of
+from sb3_belief.report.study_page.facts import DIAGNOSTICS, RunFacts, curve_of, thinned
 from sb3_belief.report.study_page.text import counted
 
 
@@ -38,7 +37,7 @@ def run_page(run: RunFacts, unit: str, back: tuple[str, str], made: str, viewer:
     return Page(
         title=f"{run.arm} on {run.environment}{seed}",
         subtitle="Run",
-        summary=[_summary(run, unit)],
+        lead=_summary(run, unit),
         notices=[f"This run does not count in the comparison: {run.why_not or run.status}."] if not run.counts else [],
         sections=[section for section in sections if section.blocks],
         footer=made,

@@ -10,7 +10,7 @@ from sb3_belief.report.figures.intervals import Interval, intervals_spec
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
 from sb3_belief.report.page.content import Column, Figure, Page, Section, Table, unique_name
 from sb3_belief.report.page.markup import tag
-from sb3_belief.report.study_page.facts import DIAGNOSTICS, StudyFacts, mean_of, thinned
+from sb3_belief.report.study_page.facts import DIAGNOSTICS, StudyFacts, curve_of, mean_of, thinned
 from sb3_belief.report.study_page.findings import ArmFinding, Findings
 from sb3_belief.report.study_page.runs import runs_section, terms_section
 from sb3_belief.report.study_page.text import (
@@ -20,6 +20,7 @@ from sb3_belief.report.study_page.text import (
     method_paragraph,
     notices,
     result_sentences,
+    sentence,
     sorted_arms,
     verdict_text,
 )
@@ -60,7 +61,8 @@ class StudyPage:
         return Page(
             title=self.facts.name,
             subtitle="Study" if self.facts.is_study else "Runs without a study",
-            summary=[method_paragraph(self.facts, self.findings), result_sentences(self.findings)],
+            lead=result_sentences(self.findings),
+            quote=method_paragraph(self.facts, self.findings),
             notices=notices(self.facts),
             sections=[section for section in sections if section.blocks],
             arms=self.colours,
@@ -76,10 +78,10 @@ class StudyPage:
 
     def _unit(self, place: str) -> str:
         normalised = place == OVERALL and self.findings.quantity == "return"
-        return f"normalised {self.findings.unit}" if normalised else self.findings.unit
+        return "normalised return" if normalised else self.findings.unit
 
     def _domain(self, place: str) -> tuple[float, float] | None:
-        return (0.0, 1.0) if self.findings.quantity == "success" or place == OVERALL else None
+        return (0.0, 1.0) if self.findings.quantity == "success" else None
 
     # ---- results
     def _results(self) -> Section:
@@ -107,7 +109,7 @@ class StudyPage:
         columns = [
             Column("environment", "environment"),
             Column("arm", "algorithm"),
-            Column("iqm", f"IQM of the {self.findings.unit}", "number", help="Interquartile mean over the seeds"),
+            Column("iqm", "IQM", "number", help=f"Interquartile mean of the {self.findings.unit} over the seeds"),
             Column("interval", "95 % interval", "interval", help="Stratified bootstrap over the seeds"),
             Column("seeds", "runs", "count"),
         ]
@@ -116,7 +118,7 @@ class StudyPage:
                 Column("verdict", f"than {baseline}", "verdict", help="Better or worse where the intervals are disjoint"),
                 Column(
                     "seeds_needed",
-                    "seeds to decide",
+                    "seeds needed",
                     "count",
                     help="How many seeds would make the intervals disjoint, if means and spread stayed as they are",
                 ),
@@ -126,7 +128,7 @@ class StudyPage:
                     "number",
                     help=f"Probability that a run scores higher than one of {baseline}",
                 ),
-                Column("improvement_interval", "its 95 % interval", "interval"),
+                Column("improvement_interval", "its 95 % interval", "interval", shown=False),
                 Column("p_holm", "p (Holm)", "number", help="p-value, corrected for the number of comparisons after Holm"),
             ]
         rows = []
@@ -149,31 +151,24 @@ class StudyPage:
                         p_holm=each.comparison.p_holm,
                     )
                 rows.append(row)
-        return Table(self._name("results"), f"{self.findings.unit.capitalize()} of each algorithm", columns, rows)
+        return Table(self._name("results"), f"{sentence(self.findings.unit)} of each algorithm", columns, rows)
 
     def _others(self) -> Table:
         columns = [
             Column("environment", "environment"),
             Column("arm", "algorithm"),
-            Column("checkpoint", "team"),
-            Column("actions", "actions"),
-            Column("iqm", "IQM", "number"),
-            Column("interval", "95 % interval", "interval"),
-            Column("seeds", "runs", "count"),
         ]
-        rows = [
-            {
-                "environment": each.environment,
-                "arm": each.arm,
-                "checkpoint": each.checkpoint,
-                "actions": "greedy" if each.deterministic else "sampled",
-                "iqm": each.score.value,
-                "interval": ends(each.score),
-                "seeds": each.n_runs,
-            }
-            for each in self.findings.others
-        ]
-        return Table(self._name("other-evaluations"), "The same by other ways to evaluate", columns, rows)
+        rows: dict[tuple[str, str], dict[str, Any]] = {}
+        for each in self.findings.others:
+            way = f"{each.checkpoint}, {'greedy' if each.deterministic else 'sampled'}"
+            if way not in [column.key for column in columns]:
+                columns += [Column(way, way, "number"), Column(f"{way} 95 %", "95 % interval", "interval")]
+            row = rows.setdefault((each.environment, each.arm), {"environment": each.environment, "arm": each.arm})
+            row.update({way: each.score.value, f"{way} 95 %": ends(each.score)})
+        order = list(self.findings.environments)
+        by_place = sorted(rows.values(), key=lambda row: order.index(row["environment"]))
+        caption = "The same of the best and of the last team, with greedy and with sampled actions"
+        return Table(self._name("other-evaluations"), caption, columns, by_place)
 
     # ---- curves
     def _curves(self) -> Section:
@@ -185,7 +180,7 @@ class StudyPage:
             name = self._name("learning", OVERALL)
             figures.insert(0, self._curve_figure(name, OVERALL, self.findings.overall_curves, x_title="share of the training"))
         text = (
-            f"{self._unit('').capitalize()} in the evaluations during training: the interquartile mean over the seeds, its "
+            f"{sentence(self.findings.unit)} in the evaluations during training: the interquartile mean over the seeds, its "
             "95 % interval as a band, and each seed as a thin line. Point at a line to read its seed and value; click an "
             "algorithm to hide it."
         )
@@ -311,7 +306,7 @@ class StudyPage:
                     description = f"{title} over joint steps on {environment}; at the end: {listed(heights)}"
                     figures.append(Figure(self._name(key.replace("/", "-"), environment), environment, spec, description))
             if figures:
-                blocks += [tag("h3", title), f"{meaning[:1].upper()}{meaning[1:]}.", figures]
+                blocks += [tag("h3", title), f"{sentence(meaning)}.", figures]
         if blocks:
             blocks.insert(
                 0, "Means over the agents of a team, measured on steps not yet trained on: the line is the mean over seeds."
@@ -324,22 +319,6 @@ class StudyPage:
             if run.counts and run.environment == environment and key in run.diagnostics and run.seed is not None:
                 found.setdefault(run.arm, {})[run.seed] = thinned(mean_of(run.diagnostics[key]))
         return {arm: curve_of(found[arm]) for arm in self.findings.arms if arm in found}
-
-
-def curve_of(series: Mapping[int | str, tuple[np.ndarray, np.ndarray]]) -> Curve:
-    """
-    Return the curve of several series: their mean, each a thin line.
-
-    :param series: {seed or other name: steps and values}
-    :return: The curve
-    """
-    steps, means = mean_of(series)
-    seeds = {}
-    for name, (own, values) in series.items():
-        row = np.full(len(steps), np.nan)
-        row[np.searchsorted(steps, own)] = values
-        seeds[name] = row
-    return Curve(steps, means, seeds=seeds if len(series) > 1 else {})
 
 
 def _interval(finding: ArmFinding) -> Interval:

@@ -46,17 +46,18 @@ def method_paragraph(facts: StudyFacts, findings: Findings) -> str:
     :return: The paragraph
     """
     environments = list(findings.environments)
+    if not environments:
+        return ""
     counted_runs = [run for run in facts.runs if run.counts]
     others = [arm for arm in findings.arms if arm != findings.baseline]
     if findings.baseline is not None and others:
-        compared = f"{listed(others)} {'is' if len(others) == 1 else 'are'} compared with {findings.baseline}"
+        compared = f"We compare {listed(others)} with {findings.baseline}"
     else:
-        compared = f"{listed(findings.arms)} {'is' if len(findings.arms) == 1 else 'are'} measured"
+        compared = f"We measure {listed(findings.arms)}"
     numbers = sorted({len(each.seeds) for arms in findings.environments.values() for each in arms.values()})
     seeds = counted(numbers[0], "seed") if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} seeds"
     sentences = [
-        f"{compared[:1].upper()}{compared[1:]} on {listed(environments)}, with {seeds} each "
-        f"({counted(len(counted_runs), 'run')} of {_steps(facts)}).",
+        f"{compared} on {listed(environments)}, with {seeds} each ({counted(len(counted_runs), 'run')} of {_steps(facts)}).",
         _protocol(facts, findings),
         _statistics(findings),
         _versions(facts),
@@ -71,20 +72,35 @@ def result_sentences(findings: Findings) -> str:
     :param findings: The findings
     :return: The sentences
     """
-    places = {OVERALL: findings.overall} if findings.overall else findings.environments
+    if not findings.environments:
+        return "No run has finished yet, so there is nothing to compare."
     sentences = []
-    for place, arms in places.items():
-        normalised = "normalised " if place == OVERALL and findings.quantity == "return" else ""
+    for place, arms in ({OVERALL: findings.overall} if findings.overall else findings.environments).items():
+        unit = "normalised return" if place == OVERALL and findings.quantity == "return" else findings.unit
         parts = [f"{arm} {_with_interval(each.score)}{_verdict(each, findings.baseline)}" for arm, each in arms.items()]
-        sentences.append(f"On {place}, the interquartile mean of the {normalised}{findings.unit} is {'; '.join(parts)}.")
+        sentences.append(
+            f"{'Over' if place == OVERALL else 'On'} {place}, the interquartile mean of the {unit} is {'; '.join(parts)}."
+        )
     if findings.overall and findings.baseline is not None:
+        parts = []
         for arm in findings.arms:
             verdicts = [arms[arm].comparison for arms in findings.environments.values() if arm in arms]
             words = [each.verdict for each in verdicts if each is not None]
+            counts = [f"{word} on {words.count(word)}" for word in ("better", "worse", "undecided") if word in words]
             if words:
-                counts = [f"{word} on {words.count(word)}" for word in ("better", "worse", "undecided") if word in words]
-                sentences.append(f"By environment, {arm} is {listed(counts)} of {len(words)}.")
-    return " ".join(sentences)
+                parts.append(f"{arm} is {listed(counts)} of {len(words)}")
+        sentences.append(f"By environment, compared with {findings.baseline}: {'; '.join(parts)}.")
+    return "\n".join(sentences)
+
+
+def sentence(words: str) -> str:
+    """
+    Return words as they begin a sentence.
+
+    :param words: The words, which are no name
+    :return: The same with a capital letter
+    """
+    return f"{words[:1].upper()}{words[1:]}"
 
 
 def verdict_text(finding: ArmFinding) -> str | None:
@@ -116,8 +132,8 @@ def notices(facts: StudyFacts) -> list[str]:
         found.append(f"{counted(len(names), 'run')} ({reason}) {verb} not count: {listed(names, most=6)}.")
     if not facts.is_study:
         found.append(
-            "These are runs without a study, which have had no final evaluation on seeds of its own: the last evaluation "
-            "during each training counts. Its episodes are few, and checkpoints were chosen by such evaluations too."
+            "These runs belong to no study and have had no final evaluation on seeds of its own: the last evaluation during "
+            "each training counts, which has fewer episodes."
         )
     return [*found, *facts.notices]
 
@@ -173,8 +189,8 @@ def _protocol(facts: StudyFacts, findings: Findings) -> str:
 
 def _statistics(findings: Findings) -> str:
     sentences = [
-        f"Scores are the {findings.unit}. Given are interquartile means over seeds with 95 % intervals by a stratified "
-        "bootstrap, widened for few seeds."
+        f"A run's score is its mean {findings.unit}. Given are interquartile means over seeds with 95 % intervals by a "
+        "stratified bootstrap, widened for few seeds."
     ]
     if findings.overall:
         how = (

@@ -29,7 +29,7 @@
       getSelection().selectAllChildren(quote);
       copy.textContent = "Selected: copy it with Ctrl-C";
     }
-    setTimeout(() => { copy.textContent = "Copy"; }, 2500);
+    setTimeout(() => { copy.textContent = "Copy this paragraph"; }, 2500);
   });
 
   // ---- tables --------------------------------------------------------------------------------------------------
