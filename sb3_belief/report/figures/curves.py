@@ -1,5 +1,6 @@
 """Curves over joint steps and profiles over scores: lines with bands, and a thin line for each seed."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -167,11 +168,11 @@ def _is_short(curves: Mapping[str, Curve]) -> bool:
 
 def _hover(x: dict[str, Any], y: dict[str, Any], color: dict[str, Any], of_what: Sequence[str]) -> dict[str, Any]:
     fields = ["arm", "seed"][: len(of_what)]
-    tooltip = [
-        *({"field": field, "type": "nominal", "title": word} for field, word in zip(fields, of_what, strict=True)),
-        {"field": "x", "type": "quantitative", "title": x["title"], "format": ",.6~g"},
-        {"field": "y", "type": "quantitative", "title": y["title"] or "value", "format": ".4~g"},
-    ]
+    # Vega-Lite finds the nearest point by cells around all points, whose datum is the point; it forgets so for names
+    row = "(datum.datum || datum)"
+    lines = {word: f"{row}.{field}" for field, word in zip(fields, of_what, strict=True)}
+    lines |= {x["title"]: f"format({row}.x, ',.6~g')", y["title"] or "value": f"format({row}.y, '.4~g')"}
+    tooltip = "{" + ", ".join(f"{json.dumps(word)}: {value}" for word, value in lines.items()) + "}"
     return {
         "name": "hover",
         "data": {"name": "seeds" if "seed" in fields else "centres"},
@@ -189,5 +190,5 @@ def _hover(x: dict[str, Any], y: dict[str, Any], color: dict[str, Any], of_what:
             }
         ],
         "mark": {"type": "point", "filled": True, "size": 42, "opacity": 0},
-        "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip},
+        "encoding": {"x": x, "y": y, "color": color, "tooltip": {"value": {"expr": tooltip}}},
     }

@@ -79,8 +79,8 @@ def _colours() -> str:
             f":root {{ --font: {FONT}; {light} }}",
             f'@media (prefers-color-scheme: dark) {{ :root:not([data-theme="light"]) {{ {dark} }} }}',
             f':root[data-theme="dark"] {{ {dark} }}',
-            # Paper is light, whatever the screen is
-            f"@media print {{ :root, :root[data-theme] {{ color-scheme: light; {light} }} }}",
+            # Paper is light, whatever the screen is: the id that is not there makes the rule weigh more than those above
+            f"@media print {{ :root:not(#none) {{ color-scheme: light; {light} }} }}",
         ]
     )
 
@@ -126,8 +126,8 @@ def _figures(figures: Sequence[Figure], page: Page, files: str | None) -> Iterat
     shown = [arm for arm in page.arms if any(_holds(figure.spec, arm) for figure in figures)]
     if len(shown) > 1:
         yield tag("ul", *(tag("li", _legend_button(arm, page)) for arm in shown), class_="legend", aria_label="Algorithms")
-    alone = " one" if len(figures) == 1 else ""
-    yield tag("div", *(_figure(figure, files) for figure in figures), class_=f"figures{alone}")
+    beside = {1: " one", 2: " two", 4: " two"}.get(len(figures), "")
+    yield tag("div", *(_figure(figure, files) for figure in figures), class_=f"figures{beside}")
 
 
 def _legend_button(arm: str, page: Page) -> Html:
@@ -163,7 +163,10 @@ def _figure(figure: Figure, files: str | None) -> Html:
     links = None
     if files is not None:
         address = f"{files}/{FIGURES}/{figure.name}"
-        links = tag("span", *_joined([tag("a", kind.upper(), href=_address(f"{address}.{kind}")) for kind in ("svg", "png")]))
+        kinds = ("svg", "png")
+        links = tag(
+            "span", *_joined([tag("a", kind.upper(), href=_address(f"{address}.{kind}")) for kind in kinds]), class_="files"
+        )
     # It takes a tenth of a second, too long for thousands of them
     picture = Html(still_svg(figure.spec)) if figure.still else None
     drawing = tag("div", picture, class_="drawing" if figure.still else "drawing empty", data_figure=figure.name)

@@ -10,6 +10,8 @@ from sb3_belief.report.page.markup import tag
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, RunFacts, curve_of, thinned
 from sb3_belief.report.study_page.text import counted
 
+SUCCESS_RATE = "success rate"
+
 
 def run_page(run: RunFacts, unit: str, back: tuple[str, str], made: str, viewer: str | None = None) -> Page:
     """
@@ -39,6 +41,7 @@ def run_page(run: RunFacts, unit: str, back: tuple[str, str], made: str, viewer:
         subtitle="Run",
         lead=_summary(run, unit),
         notices=[f"This run does not count in the comparison: {run.why_not or run.status}."] if not run.counts else [],
+        arms=arm_colours(run.evaluations),
         sections=[section for section in sections if section.blocks],
         footer=made,
         back=back,
@@ -60,7 +63,8 @@ def _curves(run: RunFacts, unit: str, names: set[str]) -> list[Any]:
     if not curves:
         return []
     colours, dashes = arm_colours(run.evaluations), arm_dashes(list(run.evaluations))
-    spec = curves_spec("Learning curve", curves, colours, dashes, y_title=unit, of_what=("curve", ""))
+    domain = (0.0, 1.0) if unit == SUCCESS_RATE else None
+    spec = curves_spec("Learning curve", curves, colours, dashes, y_title=unit, y_domain=domain, of_what=("curve", ""))
     description = f"{unit} over joint steps: {', '.join(curves)}"
     return [[Figure(unique_name("learning", names), "Learning curve", spec, description)]]
 

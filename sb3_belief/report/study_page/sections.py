@@ -162,12 +162,14 @@ class StudyPage:
         for each in self.findings.others:
             way = f"{each.checkpoint}, {'greedy' if each.deterministic else 'sampled'}"
             if way not in [column.key for column in columns]:
-                columns += [Column(way, way, "number"), Column(f"{way} 95 %", "95 % interval", "interval")]
+                columns += [Column(way, way, "number"), Column(f"{way} 95 %", "95 % interval", "interval", shown=False)]
             row = rows.setdefault((each.environment, each.arm), {"environment": each.environment, "arm": each.arm})
             row.update({way: each.score.value, f"{way} 95 %": ends(each.score)})
         order = list(self.findings.environments)
         by_place = sorted(rows.values(), key=lambda row: order.index(row["environment"]))
-        caption = "The same of the best and of the last team, with greedy and with sampled actions"
+        caption = (
+            "The same of the best and of the last team, with greedy and with sampled actions (intervals are in the CSV file)"
+        )
         return Table(self._name("other-evaluations"), caption, columns, by_place)
 
     # ---- curves
@@ -201,9 +203,7 @@ class StudyPage:
             x_format="~s" if x_title == "joint steps" else ".0%",
         )
         heights = [f"{arm} {_last(curves[arm]):.3g}" for arm in arms]
-        return Figure(
-            name, title or place, spec, f"{self._unit(place)} over joint steps on {place}; at the end: {listed(heights)}"
-        )
+        return Figure(name, place, spec, f"{self._unit(place)} over joint steps on {place}; at the end: {listed(heights)}")
 
     def _profiles(self) -> Section:
         blocks: list[Any] = []
@@ -269,7 +269,7 @@ class StudyPage:
     def _ablations(self) -> list[Section]:
         blocks: list[Any] = []
         for title, arms in self.facts.ablations.items():
-            figures = []
+            learning, final = [], []
             for environment, found in self.findings.environments.items():
                 present = [arm for arm in arms if arm in found]
                 if not present:
@@ -278,7 +278,7 @@ class StudyPage:
                 known = {arm: curve for arm, curve in curves.items() if curve is not None}
                 if known:
                     name = self._name("ablation", title, environment, "learning")
-                    figures.append(self._curve_figure(name, environment, known, f"{title}: {environment}"))
+                    learning.append(self._curve_figure(name, environment, known, f"{title}: {environment}"))
                 spec = intervals_spec(
                     f"{title}: {environment}",
                     {arm: _interval(found[arm]) for arm in present},
@@ -286,11 +286,9 @@ class StudyPage:
                     self.findings.unit,
                 )
                 description = f"Interquartile mean and interval of {listed(present)} on {environment}"
-                figures.append(
-                    Figure(self._name("ablation", title, environment), f"{environment}: final score", spec, description)
-                )
-            if figures:
-                blocks += [tag("h3", title), figures]
+                final.append(Figure(self._name("ablation", title, environment), environment, spec, description))
+            if final:
+                blocks += [tag("h3", title), *([learning] if learning else []), final]
         return [Section("ablations", "Ablations", blocks)] if blocks else []
 
     # ---- diagnostics of the belief
