@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_belief.report.learning_curve import read_episodes, read_evaluations
-from sb3_belief.study.groups import labels
+from sb3_belief.study.groups import LENGTH, labels
 from sb3_belief.study.run_reading import DAMAGED, RunData, read_run, run_folders
 from sb3_belief.zoo.errors import ConfigError, short
 
@@ -30,7 +30,7 @@ def print_runs(folder: str) -> None:
     if not os.path.isdir(folder):
         raise ConfigError(f"runs: no folder {short(folder)}: give one with runs, such as that of train -f (default: logs).")
     runs = [read_run(path) for path in run_folders(Path(folder))]
-    rows = [_row(run, label, Path(folder)) for run, label in zip(runs, labels(runs), strict=True)]
+    rows = [_row(run, label, Path(folder)) for run, label in zip(runs, labels(runs, ignored=LENGTH), strict=True)]
     console = Console()
     if not console.is_terminal:
         for row in (_COLUMNS, *rows):

@@ -14,7 +14,7 @@ from sb3_belief.report.learning_curve import QUANTITIES, read_episodes, read_eva
 from sb3_belief.report.page.content import unique_name
 from sb3_belief.report.page.files import FIGURE_FORMATS, write_figure
 from sb3_belief.report.study_page.facts import Series, curve_of, thinned
-from sb3_belief.study.groups import labels
+from sb3_belief.study.groups import LENGTH, labels
 from sb3_belief.study.run_reading import RunData, read_run, run_folders
 from sb3_belief.zoo.errors import ConfigError, reason_of, short
 
@@ -41,7 +41,7 @@ def plot_runs(folders: Sequence[str], output: str, quantity: str | None = None, 
         raise ConfigError(f"-o: {short(output)} must end in {' or '.join(FIGURE_FORMATS)}.")
     check_drawing()
     runs = _runs(folders)
-    names = dict(zip([run.folder for run in runs], labels(runs), strict=True))
+    names = dict(zip([run.folder for run in runs], labels(runs, ignored=LENGTH), strict=True))
     environments = list(dict.fromkeys(run.env for run in runs))
     specs = {}
     for env in environments:

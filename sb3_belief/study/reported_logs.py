@@ -31,7 +31,7 @@ def reported_logs(folder: Path) -> Reported:
     data = [read_run(path) for path in run_folders(folder)]
     if not data:
         raise ConfigError(f"{short(str(folder))}: holds no run and no study: give the folder of a study, or one with runs.")
-    names = labels(data)
+    names = labels(data, deciding=[run for run in data if not _why_not(run)])
     runs = [ReportedRun(each, label, why_not=_why_not(each)) for each, label in zip(data, names, strict=True)]
     rows: list[dict[str, Any]] = []
     newest = _newest(runs)

@@ -16,7 +16,7 @@ from sb3_belief.report.page.content import Page
 from sb3_belief.report.page.files import files_folder, write_page
 from sb3_belief.report.page.render import render_page
 from sb3_belief.report.study_page.facts import RunFacts, StudyFacts
-from sb3_belief.report.study_page.findings import Findings, default_quantity, find
+from sb3_belief.report.study_page.findings import Findings, default_quantity, findings_of
 from sb3_belief.report.study_page.run_page import run_page
 from sb3_belief.report.study_page.runs import run_names
 from sb3_belief.report.study_page.sections import StudyPage
@@ -71,7 +71,7 @@ def write_report(options: ReportOptions) -> tuple[Path, str]:
         raise ConfigError(f"-o: cannot make the folder {short(str(files_folder(output)))} ({reason_of(error)}).") from None
     quantity = options.quantity or default_quantity(reported.table)
     try:
-        findings = find(reported.table, reported.arms, baseline, quantity)
+        findings = findings_of(reported.table, reported.arms, baseline, quantity)
     except ValueError as error:
         raise ConfigError(f"report: {error}") from None
     facts = _facts(reported, findings)

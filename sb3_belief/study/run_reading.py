@@ -155,7 +155,9 @@ def _numbers(path: Path) -> list[dict[str, float]]:
     """Read a table of SB3's, without what is no number. A row that was cut off is left out."""
     try:
         with open(path, newline="", encoding="utf-8", errors="replace") as file:
-            rows = [row for row in csv.reader(file) if row]
+            lines = file.readlines()
+        # Even a number that can be read may be the beginning of another one
+        rows = [row for row in csv.reader(line for line in lines if line.endswith("\n")) if row]
     except (OSError, csv.Error):
         return []
     names = rows[0] if rows else []

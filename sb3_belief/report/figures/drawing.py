@@ -35,16 +35,19 @@ def figure_png(svg: str) -> bytes:
     return png
 
 
-def still_svg(spec: Mapping[str, Any]) -> str:
+def still_svg(spec: Mapping[str, Any], name: str) -> str:
     """
     Draw a figure for a page, where it stands until the page's script draws it anew, and on paper.
 
     :param spec: The figure
+    :param name: Its name, which no other figure of the page has
     :return: Element ``svg``, as wide as its place, with the page's CSS variables for colours
     """
     figure = still(on_page(spec))
     figure["width"] = _WIDTH_ON_PAGE
     svg: str = _vl_convert().vegalite_to_svg(figure)
+    # Vega numbers what clips a figure, here and in the browser: one figure would be clipped as another is
+    svg = re.sub(r'(id="|url\(#)(clip\d)', rf"\g<1>{name}-\g<2>", svg)
     # The element's size is that of its place. What it shows is said by the element around it
     svg = re.sub(r'^(<svg [^>]*?) width="[\d.]+" height="[\d.]+"', r"\1", svg)
     # These describe single lines and points, for readers of which there are none in a still figure, and are half of it

@@ -97,7 +97,7 @@ class Table:
     """
     Table of a page, which can be sorted and filtered there, and is a CSV file beside it.
 
-    :param name: Name of the file, and of the element
+    :param name: Name of the file; that of the element begins with ``table-``
     :param caption: What it shows, in a sentence
     :param columns: The columns; the first one has the headers of the rows
     :param rows: {key of the column: value}
@@ -122,7 +122,7 @@ class Figure:
     """
     Figure of a page, which is an SVG and a PNG file beside it.
 
-    :param name: Name of the files, and of the element
+    :param name: Name of the files; that of the element begins with ``figure-``
     :param title: What it shows, in a few words
     :param spec: Vega-Lite specification, see ``report.figures``
     :param description: What can be seen, for those who cannot see it
@@ -137,7 +137,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """
     Section of a page.
 
@@ -172,7 +172,7 @@ class Page:
     title: str
     subtitle: str
     lead: str
-    sections: Sequence[Section]
+    sections: Sequence[PageSection]
     quote: str = ""
     notices: Sequence[str] = ()
     arms: Mapping[str, str] = field(default_factory=dict)
@@ -230,7 +230,7 @@ def unique_name(text: str, taken: set[str]) -> str:
     :param taken: Names, in lower case, that are taken. The new one is added
     :return: Letters, digits, dots, underscores and hyphens
     """
-    stem = re.sub(r"[^\w.-]+|\.{2,}", "-", text).strip("-.")[:80] or "x"
+    stem = re.sub(r"[^\w.]+|\.{2,}", "-", text).strip("-.")[:80] or "x"
     name, number = stem, 2
     # Some file systems do not tell small letters from capital ones
     while name.lower() in taken:

@@ -41,7 +41,7 @@ def write_page(page: Page, path: str | os.PathLike[str], bundle: str) -> Path:
         with replaced_file(files / FIGURES / f"{figure.name}.vl.json", "w", encoding="utf-8") as file:
             json.dump(in_file(figure.spec), file, allow_nan=False)
     for table in page.tables():
-        write_table(table, files / TABLES / f"{table.name}.csv")
+        write_csv(table, files / TABLES / f"{table.name}.csv")
     with replaced_file(target, "w", encoding="utf-8") as file:
         file.write(text)
     return target
@@ -74,7 +74,7 @@ def write_figure(spec: Mapping[str, Any], *paths: Path) -> None:
             file.write(figure_png(svg) if path.suffix.lower() == ".png" else svg.encode())
 
 
-def write_table(table: Table, path: Path) -> None:
+def write_csv(table: Table, path: Path) -> None:
     """
     Write a table as CSV: all its values, in full, in the order of the page.
 

@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from sb3_belief.report.figures.drawing import still_svg
 from sb3_belief.report.figures.theme import DARK, FONT, LIGHT, css_variables, on_page
-from sb3_belief.report.page.content import NOTHING, Column, Figure, Page, Section, Table
+from sb3_belief.report.page.content import NOTHING, Column, Figure, Page, PageSection, Table
 from sb3_belief.report.page.markup import Html, json_script, markup_of, script_of, tag
 
 _STATIC = Path(__file__).parent / "static"
@@ -108,7 +108,7 @@ def _header(page: Page) -> Html:
     return tag("header", *parts)
 
 
-def _section(section: Section, page: Page, files: str | None) -> Html:
+def _section(section: PageSection, page: Page, files: str | None) -> Html:
     blocks: list[Html] = []
     for block in section.blocks:
         if isinstance(block, Table):
@@ -168,7 +168,7 @@ def _figure(figure: Figure, files: str | None) -> Html:
             "span", *_joined([tag("a", kind.upper(), href=_address(f"{address}.{kind}")) for kind in kinds]), class_="files"
         )
     # It takes a tenth of a second, too long for thousands of them
-    picture = Html(still_svg(figure.spec)) if figure.still else None
+    picture = Html(still_svg(figure.spec, figure.name)) if figure.still else None
     drawing = tag("div", picture, class_="drawing" if figure.still else "drawing empty", data_figure=figure.name)
     return tag(
         "figure",
@@ -210,7 +210,7 @@ def _table(table: Table, page: Page, files: str | None) -> Html:
     ]
     if files is not None:
         tools.append(tag("a", "CSV", href=_address(f"{files}/{TABLES}/{table.name}.csv")))
-    label = f"{table.name}-caption"
+    label = f"table-{table.name}-caption"
     element = tag(
         "table",
         tag("thead", tag("tr", *heads, role="row"), role="rowgroup"),
@@ -221,7 +221,7 @@ def _table(table: Table, page: Page, files: str | None) -> Html:
     )
     heading = tag("p", table.caption, class_="caption", id=label)
     scroll = tag("div", element, class_="scroll")
-    return tag("div", heading, tag("div", *tools, class_="tools"), scroll, class_="table", id=table.name)
+    return tag("div", heading, tag("div", *tools, class_="tools"), scroll, class_="table", id=f"table-{table.name}")
 
 
 def _cell(table: Table, index: int, row: Mapping[str, Any], page: Page) -> Html:

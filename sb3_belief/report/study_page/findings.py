@@ -98,7 +98,7 @@ class Findings:
         return "success rate" if self.quantity == "success" else "return per episode"
 
 
-def find(
+def findings_of(
     table: pa.Table,
     arms: Sequence[str],
     baseline: str | None,

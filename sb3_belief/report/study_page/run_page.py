@@ -5,7 +5,7 @@ from typing import Any
 
 from sb3_belief.report.figures.curves import Curve, curves_spec
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
-from sb3_belief.report.page.content import Column, Figure, Page, Section, Table, number_text, unique_name
+from sb3_belief.report.page.content import Column, Figure, Page, PageSection, Table, number_text, unique_name
 from sb3_belief.report.page.markup import tag
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, RunFacts, curve_of, thinned
 from sb3_belief.report.study_page.text import counted
@@ -30,11 +30,11 @@ def run_page(run: RunFacts, unit: str, back: tuple[str, str], made: str, viewer:
         blocks.append(tag("p", tag("a", "Watch an episode in the belief viewer", href=viewer)))
     names: set[str] = {"run", "configuration", "versions"}
     sections = [
-        Section("curves", "Curves", [*blocks, *_curves(run, unit, names)]),
-        Section("belief", "The belief", _diagnostics(run, names)),
-        Section("error", "Why it ended", [tag("pre", run.error)] if run.error else []),
-        Section("configuration", "Configuration", _configuration(run)),
-        Section("versions", "Versions", [_versions(run)] if run.versions else []),
+        PageSection("curves", "Curves", [*blocks, *_curves(run, unit, names)]),
+        PageSection("belief", "The belief", _diagnostics(run, names)),
+        PageSection("error", "Why it ended", [tag("pre", run.error)] if run.error else []),
+        PageSection("configuration", "Configuration", _configuration(run)),
+        PageSection("versions", "Versions", [_versions(run)] if run.versions else []),
     ]
     return Page(
         title=f"{run.arm} on {run.environment}{seed}",

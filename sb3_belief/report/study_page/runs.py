@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sb3_belief.report.page.content import Column, Section, Table, unique_name
+from sb3_belief.report.page.content import Column, PageSection, Table, unique_name
 from sb3_belief.report.page.markup import tag
 from sb3_belief.report.study_page.facts import RunFacts, StudyFacts
 
 
-def runs_section(facts: StudyFacts, unit: str, run_pages: Mapping[str, str]) -> Section:
+def runs_section(facts: StudyFacts, unit: str, run_pages: Mapping[str, str]) -> PageSection:
     """
     Return the section that lists all runs, also those that do not count.
 
@@ -43,10 +43,10 @@ def runs_section(facts: StudyFacts, unit: str, run_pages: Mapping[str, str]) -> 
         for run in facts.runs
     ]
     text = "Each run has a page of its own, in the folder beside this page."
-    return Section("runs", "Runs", [text, Table("runs", "All runs", columns, rows)])
+    return PageSection("runs", "Runs", [text, Table("runs", "All runs", columns, rows)])
 
 
-def terms_section(facts: StudyFacts) -> Section:
+def terms_section(facts: StudyFacts) -> PageSection:
     """
     Return the section that says what the page's words mean, and which versions ran.
 
@@ -74,7 +74,7 @@ def terms_section(facts: StudyFacts) -> Section:
         [{"package": name, "version": ", ".join(found)} for name, found in facts.versions().items()],
     )
     blocks: list[Any] = [tag("dl", *definitions, class_="terms")]
-    return Section("methods", "Terms and versions", [*blocks, *([versions] if versions.rows else [])], menu="Terms")
+    return PageSection("methods", "Terms and versions", [*blocks, *([versions] if versions.rows else [])], menu="Terms")
 
 
 def run_names(runs: Sequence[RunFacts]) -> list[str]:

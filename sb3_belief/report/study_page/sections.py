@@ -8,7 +8,7 @@ import numpy as np
 from sb3_belief.report.figures.curves import Curve, curves_spec
 from sb3_belief.report.figures.intervals import Interval, intervals_spec
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
-from sb3_belief.report.page.content import Column, Figure, Page, Section, Table, unique_name
+from sb3_belief.report.page.content import Column, Figure, Page, PageSection, Table, unique_name
 from sb3_belief.report.page.markup import tag
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, StudyFacts, curve_of, mean_of, thinned
 from sb3_belief.report.study_page.findings import ArmFinding, Findings
@@ -84,7 +84,7 @@ class StudyPage:
         return (0.0, 1.0) if self.findings.quantity == "success" else None
 
     # ---- results
-    def _results(self) -> Section:
+    def _results(self) -> PageSection:
         table = self._headline()
         figures = [
             Figure(
@@ -102,7 +102,7 @@ class StudyPage:
         ]
         blocks: list[Any] = [table, figures]
         others = self._others()
-        return Section("results", "Results", [*blocks, *([others] if others.rows else [])])
+        return PageSection("results", "Results", [*blocks, *([others] if others.rows else [])])
 
     def _headline(self) -> Table:
         baseline = self.findings.baseline
@@ -173,7 +173,7 @@ class StudyPage:
         return Table(self._name("other-evaluations"), caption, columns, by_place)
 
     # ---- curves
-    def _curves(self) -> Section:
+    def _curves(self) -> PageSection:
         figures = [
             self._curve_figure(self._name("learning", environment), environment, curves)
             for environment, curves in self.findings.curves.items()
@@ -186,7 +186,7 @@ class StudyPage:
             "95 % interval as a band, and each seed as a thin line. Point at a line to read its seed and value; click an "
             "algorithm to hide it."
         )
-        return Section("curves", "Learning curves", [text, figures] if figures else [])
+        return PageSection("curves", "Learning curves", [text, figures] if figures else [])
 
     def _curve_figure(
         self, name: str, place: str, curves: Mapping[str, Curve], title: str = "", x_title: str = "joint steps"
@@ -205,7 +205,7 @@ class StudyPage:
         heights = [f"{arm} {_last(curves[arm]):.3g}" for arm in arms]
         return Figure(name, place, spec, f"{self._unit(place)} over joint steps on {place}; at the end: {listed(heights)}")
 
-    def _profiles(self) -> Section:
+    def _profiles(self) -> PageSection:
         blocks: list[Any] = []
         profiles = [
             Figure(
@@ -239,7 +239,7 @@ class StudyPage:
                 "At 0.5 neither is better.",
                 improvements,
             ]
-        return Section("profiles", "Profiles and improvement", blocks, menu="Profiles")
+        return PageSection("profiles", "Profiles and improvement", blocks, menu="Profiles")
 
     def _improvements(self) -> list[Figure]:
         figures = []
@@ -266,7 +266,7 @@ class StudyPage:
         return figures
 
     # ---- ablations
-    def _ablations(self) -> list[Section]:
+    def _ablations(self) -> list[PageSection]:
         blocks: list[Any] = []
         for title, arms in self.facts.ablations.items():
             learning, final = [], []
@@ -289,10 +289,10 @@ class StudyPage:
                 final.append(Figure(self._name("ablation", title, environment), environment, spec, description))
             if final:
                 blocks += [tag("h3", title), *([learning] if learning else []), final]
-        return [Section("ablations", "Ablations", blocks)] if blocks else []
+        return [PageSection("ablations", "Ablations", blocks)] if blocks else []
 
     # ---- diagnostics of the belief
-    def _diagnostics(self) -> list[Section]:
+    def _diagnostics(self) -> list[PageSection]:
         blocks: list[Any] = []
         for key, (title, meaning) in DIAGNOSTICS.items():
             figures = []
@@ -309,7 +309,7 @@ class StudyPage:
             blocks.insert(
                 0, "Means over the agents of a team, measured on steps not yet trained on: the line is the mean over seeds."
             )
-        return [Section("belief", "The belief over training", blocks, menu="Belief")] if blocks else []
+        return [PageSection("belief", "The belief over training", blocks, menu="Belief")] if blocks else []
 
     def _diagnostic_curves(self, key: str, environment: str) -> dict[str, Curve]:
         found: dict[str, dict[int | str, tuple[np.ndarray, np.ndarray]]] = {}
