@@ -20,6 +20,9 @@ from sb3_belief.report.statistics import (
 )
 from sb3_belief.report.verdicts import BaselineComparison, compare_overall, compare_with_baseline
 
+# Lowest and highest possible score, if there are such
+Limits = tuple[float, float] | None
+
 # A line of hundreds of points has no more to show than one of so many
 _POINTS = 200
 _CURVE_RESAMPLES = 2_000
@@ -127,6 +130,7 @@ def findings_of(
     known = [arm for arm in arms if arm in present]
     found = {environment: {arm: of[arm] for arm in known if arm in of} for environment, of in found.items()}
     of_baseline = baseline if baseline in present else None
+    limits = (0.0, 1.0) if quantity == "success" else None
     bounds = {environment: (0.0, 1.0) for environment in found} if quantity == "success" else score_range(found)
     training = curves(table, quantity)
     several = len(shared(found)) > 1
@@ -139,16 +143,16 @@ def findings_of(
         True,
         known,
         of_baseline,
-        _by_environment(found, of_baseline),
-        _over_all(found, of_baseline, bounds) if several else {},
+        _by_environment(found, of_baseline, limits),
+        _over_all(found, of_baseline, bounds, limits) if several else {},
         {place: {arm: _curve(band) for arm, band in of.items()} for place, of in profiles.items() if of},
         {
-            environment: {arm: _learning_curve(*of[arm]) for arm in known if arm in of}
+            environment: {arm: _learning_curve(*of[arm], limits) for arm in known if arm in of}
             for environment, of in training.items()
             if environment in found
         },
-        _overall_curves(training, known, bounds) if several else {},
-        _others(table, quantity, checkpoint, known),
+        _overall_curves(training, known, bounds, limits) if several else {},
+        _others(table, quantity, checkpoint, known, limits),
     )
 
 
@@ -162,9 +166,9 @@ def default_quantity(table: pa.Table) -> str:
     return "success" if table.num_rows and not table["success"].null_count else "return"
 
 
-def _by_environment(found: Scores, baseline: str | None) -> dict[str, dict[str, ArmFinding]]:
-    estimates = estimates_by_environment(found)
-    compared = {} if baseline is None else compare_with_baseline(found, baseline)
+def _by_environment(found: Scores, baseline: str | None, limits: Limits) -> dict[str, dict[str, ArmFinding]]:
+    estimates = estimates_by_environment(found, limits=limits)
+    compared = {} if baseline is None else compare_with_baseline(found, baseline, limits=limits)
     return {
         environment: {
             arm: ArmFinding(
@@ -178,9 +182,11 @@ def _by_environment(found: Scores, baseline: str | None) -> dict[str, dict[str, 
     }
 
 
-def _over_all(found: Scores, baseline: str | None, bounds: Mapping[str, tuple[float, float]]) -> dict[str, ArmFinding]:
-    estimates = overall_estimates(found, bounds=bounds)
-    compared = [] if baseline is None else compare_overall(found, baseline, bounds=bounds)
+def _over_all(
+    found: Scores, baseline: str | None, bounds: Mapping[str, tuple[float, float]], limits: Limits
+) -> dict[str, ArmFinding]:
+    estimates = overall_estimates(found, bounds=bounds, limits=limits)
+    compared = [] if baseline is None else compare_overall(found, baseline, bounds=bounds, limits=limits)
     normalised = normalized_scores(shared(found), bounds)
     return {
         arm: ArmFinding(
@@ -196,19 +202,21 @@ def _overall_curves(
     training: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, list[int]]]],
     arms: Sequence[str],
     bounds: Mapping[str, tuple[float, float]],
+    limits: Limits,
 ) -> dict[str, Curve]:
     of_arms = {
         environment: {arm: of[arm] for arm in arms if arm in of}
         for environment, of in training.items()
         if environment in bounds
     }
-    return {arm: _curve(band) for arm, band in overall_curves(of_arms, bounds, n_resamples=_CURVE_RESAMPLES).items()}
+    bands = overall_curves(of_arms, bounds, n_resamples=_CURVE_RESAMPLES, limits=limits)
+    return {arm: _curve(band) for arm, band in bands.items()}
 
 
-def _learning_curve(steps: np.ndarray, values: np.ndarray, seeds: list[int]) -> Curve:
+def _learning_curve(steps: np.ndarray, values: np.ndarray, seeds: list[int], limits: Limits) -> Curve:
     # Of very many evaluations every second, third ... and the last
     kept = np.unique(np.append(np.arange(0, len(steps), max(1, -(-len(steps) // _POINTS))), len(steps) - 1))
-    band = efficiency_curve(steps[kept], values[:, kept], n_resamples=_CURVE_RESAMPLES)
+    band = efficiency_curve(steps[kept], values[:, kept], n_resamples=_CURVE_RESAMPLES, limits=limits)
     centre, low, high = (np.full(len(kept), np.nan) for _ in range(3))
     places = np.searchsorted(steps[kept], band.x)
     centre[places] = band.values
@@ -230,14 +238,14 @@ def _curve(band: Band) -> Curve:
     return Curve(band.x, band.values, band.low, band.high)
 
 
-def _others(table: pa.Table, quantity: str, headline: str, arms: Sequence[str]) -> list[OtherScore]:
+def _others(table: pa.Table, quantity: str, headline: str, arms: Sequence[str], limits: Limits) -> list[OtherScore]:
     found = []
     for checkpoint in ("best", "last"):
         for deterministic in (True, False):
             if headline == "current":
                 continue
             of_all = scores(table, quantity, checkpoint, deterministic)
-            for environment, of in estimates_by_environment(of_all).items():
+            for environment, of in estimates_by_environment(of_all, limits=limits).items():
                 for arm in arms:
                     if arm in of:
                         n_runs = len(of_all[environment][arm])

@@ -14,6 +14,7 @@ from sb3_belief.report.verdicts import compare_overall, compare_with_baseline  #
 
 ENVIRONMENTS, ARMS, SEEDS, STEPS = ("junction", "forest"), ("ippo", "dynamic"), 4, (1000, 2000, 3000)
 BOUNDS = {environment: (0.0, 1.0) for environment in ENVIRONMENTS}
+LIMITS = (0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -43,28 +44,30 @@ def findings(table):
 def test_the_numbers_are_those_of_the_statistics(table, findings):
     of_best = scores(table, "success", "best")
     assert (findings.quantity, findings.checkpoint, list(findings.arms)) == ("success", "best", list(ARMS))
-    estimates = estimates_by_environment(of_best)
-    compared = compare_with_baseline(of_best, "ippo")
+    estimates = estimates_by_environment(of_best, limits=LIMITS)
+    compared = compare_with_baseline(of_best, "ippo", limits=LIMITS)
     for environment in ENVIRONMENTS:
         for arm in ARMS:
             found = findings.environments[environment][arm]
             assert (found.score, found.seeds) == (estimates[environment][arm], of_best[environment][arm])
         assert findings.environments[environment]["dynamic"].comparison == compared[environment][0]
         assert findings.environments[environment]["ippo"].comparison is None
-    assert {arm: found.score for arm, found in findings.overall.items()} == overall_estimates(of_best, bounds=BOUNDS)
-    assert findings.overall["dynamic"].comparison == compare_overall(of_best, "ippo", bounds=BOUNDS)[0]
+    assert {arm: found.score for arm, found in findings.overall.items()} == overall_estimates(
+        of_best, bounds=BOUNDS, limits=LIMITS
+    )
+    assert findings.overall["dynamic"].comparison == compare_overall(of_best, "ippo", bounds=BOUNDS, limits=LIMITS)[0]
     assert findings.overall["dynamic"].comparison.verdict == "better"
     assert findings.overall["ippo"].seeds["2, forest"] == of_best["forest"]["ippo"][2]
 
 
 def test_the_curves_are_those_of_the_statistics(table, findings):
     steps, values, seeds = curves(table, "success")["forest"]["dynamic"]
-    band, curve = efficiency_curve(steps, values, n_resamples=2000), findings.curves["forest"]["dynamic"]
+    band, curve = efficiency_curve(steps, values, n_resamples=2000, limits=LIMITS), findings.curves["forest"]["dynamic"]
     for ours, theirs in ((curve.x, band.x), (curve.centre, band.values), (curve.low, band.low), (curve.high, band.high)):
         np.testing.assert_array_equal(ours, theirs)
     assert list(curve.seeds) == seeds
     np.testing.assert_array_equal(list(curve.seeds.values()), values)
-    overall = overall_curves(curves(table, "success"), BOUNDS, n_resamples=2000)
+    overall = overall_curves(curves(table, "success"), BOUNDS, n_resamples=2000, limits=LIMITS)
     np.testing.assert_array_equal(findings.overall_curves["ippo"].centre, overall["ippo"].values)
     profile = performance_profiles(scores(table, "success", "best"))
     np.testing.assert_array_equal(findings.profiles["all environments"]["ippo"].centre, profile["ippo"].values)
@@ -73,7 +76,7 @@ def test_the_curves_are_those_of_the_statistics(table, findings):
 def test_other_ways_to_evaluate_are_all_there(table, findings):
     ways = {(each.environment, each.arm, each.checkpoint, each.deterministic): each.score for each in findings.others}
     assert len(ways) == 2 * 2 * 4
-    of_last = estimates_by_environment(scores(table, "success", "last", False))
+    of_last = estimates_by_environment(scores(table, "success", "last", False), limits=LIMITS)
     assert ways["junction", "dynamic", "last", False] == of_last["junction"]["dynamic"]
 
 
