@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +37,20 @@ def reported_study(folder: Path) -> Reported:
     """
     specification = _specification(folder / STUDY)
     cells = sorted((folder / CELLS).glob(f"*/*/seed_*/{CELL}"))
+    order = _names(specification.get("algorithms"))
+    environments = _names(specification.get("environments"))
+    seeds = specification.get("seeds")
     runs, tables = [], []
     for path in cells:
         run, table = _cell(path.parent)
+        planned = run.arm in order and run.data.env in environments
+        if table is not None and not (planned and (not isinstance(seeds, list) or run.data.seed in seeds)):
+            run, table = replace(run, why_not="no longer in the study's file"), None
         runs.append(run)
         if table is not None:
             tables.append(table)
-    order = _names(specification.get("algorithms"))
     arms = [*order, *sorted({run.arm for run in runs} - set(order))]
-    environments = [*_names(specification.get("environments")), *sorted({run.data.env for run in runs})]
+    environments += sorted({run.data.env for run in runs} - set(environments))
     # The table's order is that of the page
     runs.sort(key=lambda run: (environments.index(run.data.env), arms.index(run.arm), run.data.seed or 0))
     table = pa.concat_tables([EPISODES.empty_table(), *tables]).sort_by([("arm", "ascending"), ("seed", "ascending")])

@@ -51,10 +51,9 @@ def test_plots_are_drawn_of_what_there_is(logs, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(plotting, "write_figure", lambda spec, path: drawn.update({path.name: spec}))
     assert main(["plot", str(logs), "-o", str(tmp_path / "a.png")]) == 0
     spec = drawn.pop("a.png")
-    assert spec["title"] == "x, greedy evaluations" and [row["x"] for row in spec["datasets"]["centres"]] == [1000, 2000]
-    seeds = {(row["seed"], row["x"]): row["y"] for row in spec["datasets"]["seeds"]}
-    centres = {row["x"]: row["y"] for row in spec["datasets"]["centres"]}
-    assert centres[2000] == (seeds["0", 2000] + seeds["1", 2000]) / 2
+    assert spec["title"] == "x, greedy evaluations" and [row["x"] for row in spec["datasets"]["centres"]] == [[1000, 2000]]
+    seeds = {row["seed"]: row["y"] for row in spec["datasets"]["seeds"]}
+    assert spec["datasets"]["centres"][0]["y"][1] == (seeds["0"][1] + seeds["1"][1]) / 2
     # A run that has not been evaluated twice: then the episodes of all, and another environment has its own picture
     write_run(logs / "ippo" / "x_5", "ippo", "x", 5, [0.3])
     write_run(logs / "ippo" / "y_1", "ippo", "mpe/y", 5, [0.3, 0.3])

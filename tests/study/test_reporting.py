@@ -198,6 +198,15 @@ def test_a_study_that_has_just_begun_has_a_page(tmp_path):
         write_report(ReportOptions(str(folder)))
 
 
+def test_cells_that_are_no_longer_planned_do_not_count(tmp_path):
+    folder = write_study(tmp_path / "smaller", ARMS, ["junction"], n_seeds=3, n_evaluations=2)
+    text = (folder / "study.yml").read_text()
+    (folder / "study.yml").write_text(text.replace("seeds:\n- 0\n- 1\n- 2\n", "seeds: [0, 1]\n"))
+    path, _ = write_report(ReportOptions(str(folder)))
+    shown = Page(path).shown
+    assert "2 runs (no longer in the study's file) do not count" in shown and "with 2 seeds each (4 runs" in shown
+
+
 def test_names_of_all_kinds_are_text(tmp_path):
     evil = '"><img src=x onerror=alert(1)></script>'
     folder = write_study(

@@ -87,13 +87,13 @@ def curves_spec(
             {"data": {"values": [{"y": mark}]}, "mark": {"type": "rule", "strokeDash": [4, 4], "opacity": 0.6}}
             | {"encoding": {"y": {"field": "y", "type": "quantitative"}}}
         )
-    shown = [{"filter": _SHOWN}]
+    shown, flat = [{"filter": _SHOWN}], {"flatten": ["x", "y"]}
     if any("low" in row for row in centres):
         layers.append(
             {
                 "name": "band",
                 "data": {"name": "centres"},
-                "transform": [*shown, {"filter": "isValid(datum.low)"}],
+                "transform": [*shown, {"filter": "isValid(datum.low)"}, {"flatten": ["x", "low", "high"]}],
                 "mark": {"type": "area", "opacity": 0.16, "clip": True},
                 "encoding": {"x": x, "y": y("low"), "y2": {"field": "high"}, "color": color},
             }
@@ -103,7 +103,7 @@ def curves_spec(
             {
                 "name": "seeds",
                 "data": {"name": "seeds"},
-                "transform": shown,
+                "transform": [*shown, flat],
                 "mark": {"type": "line", "clip": True},
                 "encoding": {
                     "x": x,
@@ -119,7 +119,7 @@ def curves_spec(
         {
             "name": "centre",
             "data": {"name": "centres"},
-            "transform": shown,
+            "transform": [*shown, flat],
             # Otherwise an arm with a single point would not be seen
             "mark": {"type": "line", "strokeWidth": 2.4, "clip": True, "point": _is_short(curves)},
             "encoding": {"x": x, "y": y("y"), "color": color, "strokeDash": dash},
@@ -149,17 +149,20 @@ def rounded(value: float) -> float | None:
 
 
 def _rows(curves: Mapping[str, Curve]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return a row for each line, which Vega flattens: a page of many figures is then a fifth as large."""
     centres, seeds = [], []
     for arm, curve in curves.items():
-        for index, x in enumerate(curve.x):
-            place = {"arm": arm, "x": rounded(float(x))}
-            row = {**place, "y": rounded(float(curve.centre[index]))}
-            if curve.low is not None and curve.high is not None:
-                row.update(low=rounded(float(curve.low[index])), high=rounded(float(curve.high[index])))
-            centres.append(row)
-            for seed, values in curve.seeds.items():
-                seeds.append({**place, "seed": str(seed), "y": rounded(float(values[index]))})
+        row = {"arm": arm, "x": _list(curve.x), "y": _list(curve.centre)}
+        if curve.low is not None and curve.high is not None:
+            row.update(low=_list(curve.low), high=_list(curve.high))
+        centres.append(row)
+        seeds += [{"arm": arm, "seed": str(seed), "x": row["x"], "y": _list(values)} for seed, values in curve.seeds.items()]
     return centres, seeds
+
+
+def _list(values: Sequence[float] | np.ndarray) -> list[float | int | None]:
+    found = [rounded(float(value)) for value in values]
+    return [int(value) if value is not None and value.is_integer() else value for value in found]
 
 
 def _is_short(curves: Mapping[str, Curve]) -> bool:
@@ -176,7 +179,7 @@ def _hover(x: dict[str, Any], y: dict[str, Any], color: dict[str, Any], of_what:
     return {
         "name": "hover",
         "data": {"name": "seeds" if "seed" in fields else "centres"},
-        "transform": [{"filter": _SHOWN}, {"filter": "isValid(datum.y)"}],
+        "transform": [{"filter": _SHOWN}, {"flatten": ["x", "y"]}, {"filter": "isValid(datum.y)"}],
         "params": [
             {
                 "name": "near",

@@ -26,12 +26,9 @@ def test_the_data_are_the_curve():
     spec = curve_spec()
     centres = [row for row in spec["datasets"]["centres"] if row["arm"] == "dynamic"]
     # What is not finite is a gap
-    assert centres == [
-        {"arm": "dynamic", "x": 1000.0, "y": 0.2, "low": 0.1, "high": 0.3},
-        {"arm": "dynamic", "x": 2000.0, "y": 0.4, "low": 0.3, "high": None},
-    ]
+    assert centres == [{"arm": "dynamic", "x": [1000, 2000], "y": [0.2, 0.4], "low": [0.1, 0.3], "high": [0.3, None]}]
     seeds = [(row["seed"], row["x"], row["y"]) for row in spec["datasets"]["seeds"] if row["arm"] == "ippo"]
-    assert seeds == [("0", 1000.0, 0.1), ("1", 1000.0, 0.3), ("0", 2000.0, None), ("1", 2000.0, 0.5)]
+    assert seeds == [("0", [1000, 2000], [0.1, None]), ("1", [1000, 2000], [0.3, 0.5])]
     json.dumps(spec, allow_nan=False)
 
 

@@ -127,8 +127,8 @@ def test_the_page_s_tables_and_figures_hold_these_numbers(findings, page):
     figures = {figure.name: figure.spec["datasets"] for figure in page.figures()}
     estimates = {each["arm"]: each for each in figures["scores-forest"]["estimates"]}
     assert estimates["dynamic"]["x"] == pytest.approx(findings.environments["forest"]["dynamic"].score.value, rel=1e-5)
-    centres = [each["y"] for each in figures["learning-forest"]["centres"] if each["arm"] == "ippo"]
-    np.testing.assert_allclose(centres, findings.curves["forest"]["ippo"].centre, rtol=1e-5)
+    (ippo,) = [each for each in figures["learning-forest"]["centres"] if each["arm"] == "ippo"]
+    np.testing.assert_allclose(ippo["y"], findings.curves["forest"]["ippo"].centre, rtol=1e-5)
     assert {"ablation-Parts-forest", "ablation-Parts-forest-learning", "profile-forest", "improvement-junction"} <= set(
         figures
     )
