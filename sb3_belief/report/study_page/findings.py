@@ -25,6 +25,7 @@ Limits = tuple[float, float] | None
 
 # A line of hundreds of points has no more to show than one of so many
 _POINTS = 200
+# Bands are looked at, and their intervals are many
 _CURVE_RESAMPLES = 2_000
 
 
@@ -134,9 +135,15 @@ def findings_of(
     bounds = {environment: (0.0, 1.0) for environment in found} if quantity == "success" else score_range(found)
     training = curves(table, quantity)
     several = len(shared(found)) > 1
-    profiles = {environment: performance_profiles({environment: of}, _thresholds(of)) for environment, of in found.items()}
+    profiles = {
+        environment: performance_profiles({environment: of}, _thresholds(of), n_resamples=_CURVE_RESAMPLES)
+        for environment, of in found.items()
+    }
     if several:
-        profiles = {overall_name: performance_profiles(normalized_scores(found, bounds)), **profiles}
+        profiles = {
+            overall_name: performance_profiles(normalized_scores(found, bounds), n_resamples=_CURVE_RESAMPLES),
+            **profiles,
+        }
     return Findings(
         quantity,
         checkpoint,

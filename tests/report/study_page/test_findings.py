@@ -69,8 +69,9 @@ def test_the_curves_are_those_of_the_statistics(table, findings):
     np.testing.assert_array_equal(list(curve.seeds.values()), values)
     overall = overall_curves(curves(table, "success"), BOUNDS, n_resamples=2000, limits=LIMITS)
     np.testing.assert_array_equal(findings.overall_curves["ippo"].centre, overall["ippo"].values)
-    profile = performance_profiles(scores(table, "success", "best"))
+    profile = performance_profiles(scores(table, "success", "best"), n_resamples=2000)
     np.testing.assert_array_equal(findings.profiles["all environments"]["ippo"].centre, profile["ippo"].values)
+    np.testing.assert_array_equal(findings.profiles["all environments"]["ippo"].low, profile["ippo"].low)
 
 
 def test_other_ways_to_evaluate_are_all_there(table, findings):
