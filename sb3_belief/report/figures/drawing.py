@@ -9,7 +9,7 @@ from sb3_belief.report.figures.theme import in_file, on_page, still
 
 # Twice as many pixels as the figure's units, so that it is sharp on slides
 _SCALE = 2.0
-_WIDTH_ON_PAGE = 460
+_WIDTH_ON_PAGE = 390
 
 
 def figure_svg(spec: Mapping[str, Any]) -> str:
