@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sb3_belief.cli import demo, enjoy, envs, export, load, push, study, train, tune, watch
+from sb3_belief.cli import demo, enjoy, envs, export, load, plot, push, report, runs, study, train, tune, watch
 from sb3_belief.cli.flags import STYLE, Parser
 from sb3_belief.zoo.errors import ConfigError, RunFailed
 
@@ -34,7 +34,10 @@ COMMANDS = {
     "train": train,
     "enjoy": enjoy,
     "watch": watch,
+    "runs": runs,
+    "plot": plot,
     "study": study,
+    "report": report,
     "tune": tune,
     "export": export,
     "push": push,

@@ -17,7 +17,11 @@ PATIENCE = 240.0
 
 def run_in(folder: Path) -> Path | None:
     """Return the folder of the run below a log folder; None if there is none yet."""
-    found = list(folder.glob("*/*/run.json"))
+    try:
+        found = list(folder.glob("*/*/run.json"))
+    except FileNotFoundError:
+        # A run that is interrupted before it has begun removes its folder
+        return None
     return found[0].parent if found else None
 
 

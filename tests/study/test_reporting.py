@@ -26,7 +26,12 @@ class Page(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.open, self.words, self.addresses, self.ids, self.scripts, self.tags = [], [], [], [], [], []
+        self.open: list[str] = []
+        self.words: list = []
+        self.addresses: list = []
+        self.ids: list = []
+        self.scripts: list = []
+        self.tags: list = []
         self.text = path.read_text(encoding="utf-8")
         self.feed(self.text)
         self.close()

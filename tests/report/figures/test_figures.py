@@ -13,7 +13,7 @@ COLOURS, DASHES = arm_colours(ARMS, "ippo"), arm_dashes(ARMS, "ippo")
 
 
 def curve_spec():
-    seeds = {0: [0.1, np.nan], 1: [0.3, 0.5]}
+    seeds: dict = {0: [0.1, np.nan], 1: [0.3, 0.5]}
     curves = {arm: Curve([1000, 2000], [0.2, 0.4], [0.1, 0.3], [0.3, np.inf], seeds) for arm in ARMS}
     return curves_spec("A & B", curves, COLOURS, DASHES, y_title="success rate", y_domain=(0, 1), mark=0.25)
 

@@ -40,7 +40,10 @@ def test_a_csv_file_has_all_values_in_full(tmp_path):
         Column("ci", "I", "interval"),
         Column("n", "N", "count", shown=False),
     ]
-    rows = [{"arm": 'a,"b"\n', "iqm": 1 / 3, "ci": (0.1, 1 / 7), "n": 5}, {"arm": "ä", "iqm": None, "ci": None, "n": 0}]
+    rows: list[dict] = [
+        {"arm": 'a,"b"\n', "iqm": 1 / 3, "ci": (0.1, 1 / 7), "n": 5},
+        {"arm": "ä", "iqm": None, "ci": None, "n": 0},
+    ]
     write_csv(Table("t", "T", columns, rows), tmp_path / "t.csv")
     with open(tmp_path / "t.csv", newline="", encoding="utf-8") as file:
         read = list(csv.reader(file))
@@ -50,6 +53,6 @@ def test_a_csv_file_has_all_values_in_full(tmp_path):
 
 
 def test_names_lead_nowhere_and_differ_on_every_file_system():
-    taken = set()
+    taken: set[str] = set()
     names = [unique_name(text, taken) for text in ("../../etc", "A b", "a-b", "...", "mpe/x_v3", "é" * 200)]
     assert names == ["etc", "A-b", "a-b-2", "x", "mpe-x_v3", "é" * 80]

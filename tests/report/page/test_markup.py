@@ -19,7 +19,9 @@ def test_strings_are_escaped_and_markup_is_not():
 def test_no_data_ends_its_script():
     data = {"</script><script>alert(1)</script>": ["<!--", "&amp;", "\u2028", "Ω"]}
     element = json_script("figures", data)
-    text = re.fullmatch(r'<script type="application/json" id="figures">(.*)</script>', element, re.DOTALL)[1]
+    found = re.fullmatch(r'<script type="application/json" id="figures">(.*)</script>', element, re.DOTALL)
+    assert found is not None
+    text = found[1]
     assert "<" not in text and ">" not in text and "&" not in text and "\u2028" not in text and "Ω" in text
     assert json.loads(text) == data
     with pytest.raises(ValueError, match="not JSON compliant"):
