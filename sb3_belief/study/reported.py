@@ -41,6 +41,7 @@ class Reported:
     :param evaluation_every: Joint steps between evaluations; None if they differ or are not known
     :param evaluation_episodes: Episodes of an evaluation; None likewise
     :param final_episodes: Episodes of a final evaluation; None likewise
+    :param is_online: Whether the episodes of the trainings themselves count, instead of evaluations
     :param ablations: {title of a panel: its arms}
     :param notices: Further things that the reader must know
     """
@@ -55,5 +56,6 @@ class Reported:
     evaluation_every: int | None = None
     evaluation_episodes: int | None = None
     final_episodes: int | None = None
+    is_online: bool = False
     ablations: Mapping[str, Sequence[str]] = field(default_factory=dict)
     notices: Sequence[str] = ()

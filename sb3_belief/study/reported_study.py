@@ -75,6 +75,7 @@ def reported_study(folder: Path) -> Reported:
         evaluation_every=_number(evaluation, "every"),
         evaluation_episodes=_number(evaluation, "episodes"),
         final_episodes=_number(evaluation, "final_episodes"),
+        is_online=evaluation.get("online") is True,
         ablations=_panels(ablations),
     )
 

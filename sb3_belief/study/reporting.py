@@ -106,6 +106,7 @@ def _facts(reported: Reported, findings: Findings) -> StudyFacts:
         evaluation_every=reported.evaluation_every,
         evaluation_episodes=reported.evaluation_episodes,
         final_episodes=reported.final_episodes,
+        is_online=reported.is_online,
         ablations=reported.ablations,
         notices=reported.notices,
     )

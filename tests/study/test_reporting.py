@@ -7,11 +7,14 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+import yaml
 
 for package in ("pyarrow", "scipy", "vl_convert"):
     pytest.importorskip(package, reason="reports need the extra 'study'")
 
-from sb3_belief.report.episodes import read_episodes_table, scores  # noqa: E402
+import pyarrow as pa  # noqa: E402
+
+from sb3_belief.report.episodes import EPISODES, read_episodes_table, scores, write_episodes_table  # noqa: E402
 from sb3_belief.study.reporting import ReportOptions, write_report  # noqa: E402
 from sb3_belief.zoo.errors import ConfigError  # noqa: E402
 from tests.study.folders import ERROR, VERSIONS, cell_folder, write_cell_record, write_run, write_study  # noqa: E402
@@ -201,6 +204,29 @@ def test_a_study_that_has_just_begun_has_a_page(tmp_path):
     (folder / "study.yml").write_text("name: [")
     with pytest.raises(ConfigError, match=r"study\.yml: is damaged .*: run sb3-belief study again"):
         write_report(ReportOptions(str(folder)))
+
+
+def test_the_trainings_own_episodes_count_where_nothing_else_was_evaluated(tmp_path):
+    folder = write_study(tmp_path / "own", ARMS, ENVIRONMENTS[:1], n_seeds=3, n_evaluations=4)
+    keys = {"online": True, "every": 1000, "final_episodes": 64}
+    specification = yaml.safe_load((folder / "study.yml").read_text())
+    (folder / "study.yml").write_text(yaml.safe_dump({**specification, "evaluation": keys}))
+    for path in folder.glob("cells/*/*/*/episodes.parquet"):
+        rows = read_episodes_table(path).to_pylist()
+        own = [{**row, "deterministic": False} for row in rows if row["phase"] == "training"]
+        own += [row for row in rows if row["checkpoint"] == "last" and not row["deterministic"]]
+        write_episodes_table(pa.Table.from_pylist(own, schema=EPISODES), path)
+    path, summary = write_report(ReportOptions(str(folder)))
+    assert summary.startswith("On junction, the interquartile mean of the success rate is dynamic 0.")
+    page = Page(path)
+    assert "The episodes of the training count themselves, with sampled actions: a point of a learning curve" in page.shown
+    assert "in the episodes of the training" in page.shown and "best team" not in page.shown
+    with open(files(path) / "tables" / "results.csv", newline="", encoding="utf-8") as file:
+        read = {row["arm"]: float(row["iqm"]) for row in csv.DictReader(file)}
+    table = read_episodes_table(folder / "episodes.parquet")
+    for arm, of_seeds in scores(table, "success", "last", False)["junction"].items():
+        assert read[arm] == pytest.approx(np.mean(list(of_seeds.values())))
+    assert not (files(path) / "tables" / "other-evaluations.csv").exists()
 
 
 def test_cells_that_are_no_longer_planned_do_not_count(tmp_path):

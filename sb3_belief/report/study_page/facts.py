@@ -96,6 +96,7 @@ class StudyFacts:
     :param final_episodes: Episodes of a final evaluation; None likewise
     :param ablations: {title of a panel: its arms}
     :param notices: Further things that the reader must know
+    :param is_online: Whether the episodes of the trainings themselves count, instead of evaluations
     """
 
     name: str
@@ -106,6 +107,7 @@ class StudyFacts:
     final_episodes: int | None = None
     ablations: Mapping[str, Sequence[str]] = field(default_factory=dict)
     notices: Sequence[str] = ()
+    is_online: bool = False
 
     def versions(self) -> dict[str, list[str]]:
         """

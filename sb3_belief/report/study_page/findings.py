@@ -25,6 +25,8 @@ Limits = tuple[float, float] | None
 
 # A line of hundreds of points has no more to show than one of so many
 _POINTS = 200
+# Which weights count and whether they act greedily, those that a table has of these
+_WAYS = [(checkpoint, deterministic) for checkpoint in ("best", "last", "current") for deterministic in (True, False)]
 # Bands are looked at, and their intervals are many
 _CURVE_RESAMPLES = 2_000
 
@@ -112,7 +114,8 @@ def findings_of(
     """
     Return what statistics say of the episodes of a study.
 
-    The best team of each run counts, acting greedily; where there are no final evaluations the last one while training.
+    The best team of each run counts, acting greedily; where it was not evaluated so, the last team, then the last evaluation
+    while training, and sampled actions.
 
     :param table: The episodes of all runs that count (``report.episodes``)
     :param arms: The arms in order, of which some may have no runs
@@ -125,15 +128,16 @@ def findings_of(
     quantity = quantity or default_quantity(table)
     if not table.num_rows:
         return Findings(quantity, "best", True, [], None, {})
-    checkpoint = next(each for each in ("best", "last", "current") if each in table["checkpoint"].unique().to_pylist())
-    found = scores(table, quantity, checkpoint)
+    ways = _ways(table)
+    checkpoint, deterministic = ways[0]
+    found = scores(table, quantity, checkpoint, deterministic)
     present = {arm for of_arms in found.values() for arm in of_arms}
     known = [arm for arm in arms if arm in present]
     found = {environment: {arm: of[arm] for arm in known if arm in of} for environment, of in found.items()}
     of_baseline = baseline if baseline in present else None
     limits = (0.0, 1.0) if quantity == "success" else None
     bounds = {environment: (0.0, 1.0) for environment in found} if quantity == "success" else score_range(found)
-    training = curves(table, quantity)
+    training = curves(table, quantity, deterministic=("current", True) in ways)
     several = len(shared(found)) > 1
     profiles = {
         environment: performance_profiles({environment: of}, _thresholds(of), n_resamples=_CURVE_RESAMPLES)
@@ -147,7 +151,7 @@ def findings_of(
     return Findings(
         quantity,
         checkpoint,
-        True,
+        deterministic,
         known,
         of_baseline,
         _by_environment(found, of_baseline, limits),
@@ -159,7 +163,7 @@ def findings_of(
             if environment in found
         },
         _overall_curves(training, known, bounds, limits) if several else {},
-        _others(table, quantity, checkpoint, known, limits),
+        _others(table, quantity, ways, known, limits),
     )
 
 
@@ -245,16 +249,26 @@ def _curve(band: Band) -> Curve:
     return Curve(band.x, band.values, band.low, band.high)
 
 
-def _others(table: pa.Table, quantity: str, headline: str, arms: Sequence[str], limits: Limits) -> list[OtherScore]:
+def _ways(table: pa.Table) -> list[tuple[str, bool]]:
+    """Return the ways in which teams were evaluated, the one that counts first."""
+    there = {
+        (row["checkpoint"], row["deterministic"])
+        for row in table.group_by(["checkpoint", "deterministic"]).aggregate([]).to_pylist()
+    }
+    return [way for way in _WAYS if way in there]
+
+
+def _others(
+    table: pa.Table, quantity: str, ways: Sequence[tuple[str, bool]], arms: Sequence[str], limits: Limits
+) -> list[OtherScore]:
+    final = [way for way in ways if way[0] != "current"]
     found = []
-    for checkpoint in ("best", "last"):
-        for deterministic in (True, False):
-            if headline == "current":
-                continue
-            of_all = scores(table, quantity, checkpoint, deterministic)
-            for environment, of in estimates_by_environment(of_all, limits=limits).items():
-                for arm in arms:
-                    if arm in of:
-                        n_runs = len(of_all[environment][arm])
-                        found.append(OtherScore(environment, arm, checkpoint, deterministic, of[arm], n_runs))
+    # One alone is that of the headline
+    for checkpoint, deterministic in final if len(final) > 1 else ():
+        of_all = scores(table, quantity, checkpoint, deterministic)
+        for environment, of in estimates_by_environment(of_all, limits=limits).items():
+            for arm in arms:
+                if arm in of:
+                    n_runs = len(of_all[environment][arm])
+                    found.append(OtherScore(environment, arm, checkpoint, deterministic, of[arm], n_runs))
     return found

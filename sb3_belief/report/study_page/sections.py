@@ -181,10 +181,10 @@ class StudyPage:
         if self.findings.overall_curves:
             name = self._name("learning", OVERALL)
             figures.insert(0, self._curve_figure(name, OVERALL, self.findings.overall_curves, x_title="share of the training"))
+        where = "the episodes of the training" if self.facts.is_online else "the evaluations during training"
         text = (
-            f"{sentence(self.findings.unit)} in the evaluations during training: the interquartile mean over the seeds, its "
-            "95 % interval as a band, and each seed as a thin line. Point at a line to read its seed and value; click an "
-            "algorithm to hide it."
+            f"{sentence(self.findings.unit)} in {where}: the interquartile mean over the seeds, its 95 % interval as a band, "
+            "and each seed as a thin line. Point at a line to read its seed and value; click an algorithm to hide it."
         )
         return PageSection("curves", "Learning curves", [text, figures] if figures else [])
 

@@ -174,6 +174,13 @@ def _steps(facts: StudyFacts) -> str:
 
 
 def _protocol(facts: StudyFacts, findings: Findings) -> str:
+    if facts.is_online:
+        every = "" if facts.evaluation_every is None else f" of {facts.evaluation_every:,} joint steps"
+        last = "the last ones" if facts.final_episodes is None else f"the last {facts.final_episodes:,}"
+        return (
+            "The episodes of the training count themselves, with sampled actions: a point of a learning curve is the mean of "
+            f"those{every}, and a run's score that of {last}."
+        )
     manner = "acting greedily" if findings.deterministic else "sampling its actions"
     every = "" if facts.evaluation_every is None else f" every {facts.evaluation_every:,} joint steps"
     episodes = "" if facts.evaluation_episodes is None else f" over {counted(facts.evaluation_episodes, 'episode')}"
