@@ -49,7 +49,8 @@ def test_steps_are_counted_as_they_were_done(written):
     assert junction_rows == [[4 * 8]] * 2
     together = [steps for (part, _), steps in rows.items() if part == "together"]
     assert together == [[8 * 8]] * 4 + [[4 * 8]] * 4
-    assert rows["checkpoints", "none"] == rows["checkpoints", "as by default"] == [4 * 8]
+    # With one short call a state is kept in most of it
+    assert 0 < written["ratios"]["checkpoints_vs_none"] < 1
     if cores() > 1:
         assert rows["cores", "1 job"] == rows["cores", "2 jobs"] == [3 * 4 * 8]
         assert rows["cores", "2 teams"] == [2 * 3 * 4 * 8]
