@@ -47,7 +47,7 @@ test: $(STAMP)  ## run all tests but the slow ones
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" $(PYTEST_ARGS)
 
 test-slow: $(STAMP)  ## play the games that prove the belief dynamic
-	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist load -m slow $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m slow $(PYTEST_ARGS)
 
 pytest: test
 
