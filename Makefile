@@ -8,6 +8,8 @@ SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
 RL_ZOO3_VENV := .venv-rl-zoo3
 RL_ZOO3_STAMP := $(RL_ZOO3_VENV)/.installed
+STATISTICS_VENV := .venv-statistics
+STATISTICS_STAMP := $(STATISTICS_VENV)/.installed
 PACKAGE_VENV := .venv-package
 PACKAGE_STAMP := $(VENV)/.installed-package
 PEERS_VENV := .venv-peers
@@ -22,7 +24,7 @@ BENCH_ARGS ?=
 SOAK_MINUTES ?= 60
 SOAK_SEED ?= 0
 
-.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 pytest conformance soak bench bench-peers docs package \
+.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-statistics pytest conformance soak bench bench-peers docs package \
 	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -96,6 +98,18 @@ $(RL_ZOO3_STAMP): setup.cfg pyproject.toml constraints.txt
 test-rl-zoo3: $(RL_ZOO3_STAMP)  ## train and search with the real rl_zoo3, in an environment of its own
 	$(RL_ZOO3_VENV)/bin/python -m pytest tests/zoo/test_rl_zoo3.py $(PYTEST_ARGS)
 
+# rliable and marl-eval have an environment of their own: the one breaks with newer arch, the other pins an old pandas
+$(STATISTICS_STAMP):
+	$(PYTHON) -m venv $(STATISTICS_VENV)
+	$(STATISTICS_VENV)/bin/python -m pip install --quiet --only-binary arch,numpy,scipy,pandas \
+		rliable==1.2.0 arch==5.6.0 'numpy<2' 'pandas<2.2' colorama 'setuptools<80' wheel
+	$(STATISTICS_VENV)/bin/python -m pip install --quiet --no-deps --no-build-isolation id-marl-eval==0.0.4
+	@touch $@
+
+test-statistics: $(STAMP) $(STATISTICS_STAMP)  ## compare our statistics with rliable's, and read our export with marl-eval
+	$(BIN)/python -m pytest tests/report/test_statistics.py \
+		tests/report/test_bands.py tests/report/test_marl_eval.py $(PYTEST_ARGS)
+
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
@@ -131,5 +145,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) $(SMAX_VENV) $(RL_ZOO3_VENV) $(PACKAGE_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) $(RL_ZOO3_VENV) $(STATISTICS_VENV) $(PACKAGE_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
