@@ -10,6 +10,7 @@ import yaml
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_value
@@ -160,6 +161,17 @@ def _reading_our_files(exp_manager: Any) -> Any:
             if self.algo in ALGOS:
                 hyperparams = self._read_strings(hyperparams)
             return super()._preprocess_hyperparams(hyperparams)
+
+        def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> Any:
+            made = super()._preprocess_schedules(hyperparams)
+            if self.algo not in ALGOS:
+                return made
+            # A saved model then names no class of rl_zoo3, so that it loads without it, and as plain data
+            simple = exp_manager.SimpleLinearSchedule
+            return {
+                key: LinearSchedule(value.initial_value, 0.0, 1.0) if isinstance(value, simple) else value
+                for key, value in made.items()
+            }
 
         def _read_strings(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
             """

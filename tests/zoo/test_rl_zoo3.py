@@ -189,6 +189,8 @@ def test_the_real_one_trains_and_searches(tmp_path, algo, flags):
     folder = tmp_path / "logs" / algo / "Car-v0_1"
     model = ALGOS[algo].load(folder / "Car-v0.zip")
     assert model.num_timesteps >= 256
+    # Of SB3, not of rl_zoo3: the file is plain data, and loads where rl_zoo3 is not
+    assert repr(model.learning_rate) == "LinearSchedule(start=0.0003, end=0.0, end_fraction=1.0)"
     assert (folder / "best_model.zip").exists() and (folder / "Car-v0" / "config.yml").exists()
 
 
