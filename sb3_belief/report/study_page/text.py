@@ -73,7 +73,7 @@ def result_sentences(findings: Findings) -> str:
     :return: The sentences
     """
     if not findings.environments:
-        return "No run has finished yet, so there is nothing to compare."
+        return "No run counts yet, so there is nothing to compare; the page names each run with the reason."
     sentences = []
     for place, arms in ({OVERALL: findings.overall} if findings.overall else findings.environments).items():
         unit = "normalised return" if place == OVERALL and findings.quantity == "return" else findings.unit
