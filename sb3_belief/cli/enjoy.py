@@ -2,8 +2,8 @@
 
 import argparse
 
-from sb3_belief.cli.flag_types import filled_text, frame_rate, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common
+from sb3_belief.cli.flag_types import frame_rate, new_path, positive_number, seed_number
+from sb3_belief.cli.flags import add_common, add_saved_team
 
 HELP = "replay a trained team"
 
@@ -14,10 +14,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
     :param parser: Parser of the command
     """
-    parser.add_argument("run", type=filled_text, help="folder of a run, or zip of a team")
-    parser.add_argument(
-        "--env", type=filled_text, help="id of the environment, for the zip of a team that was saved from Python"
-    )
+    add_saved_team(parser)
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--episodes", type=positive_number, default=1, help="number of episodes to play")
     length.add_argument("-n", "--n-timesteps", type=positive_number, help="number of steps to play instead")

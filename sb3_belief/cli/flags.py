@@ -62,6 +62,18 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_saved_team(parser: argparse.ArgumentParser) -> None:
+    """
+    Add the flags that name a saved team.
+
+    :param parser: Parser of the command
+    """
+    parser.add_argument("run", type=filled_text, help="folder of a run, or zip of a team")
+    parser.add_argument(
+        "--env", type=filled_text, help="id of the environment, for the zip of a team that was saved from Python"
+    )
+
+
 def add_common(parser: argparse.ArgumentParser) -> None:
     """
     Add the flags of all commands that load a team and make its environment.

@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common
+from sb3_belief.cli.flags import add_common, add_saved_team
 
 HELP = "show what the agents of a trained team believe of each other"
 
@@ -14,10 +14,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
     :param parser: Parser of the command
     """
-    parser.add_argument("run", type=filled_text, help="folder of a run, or zip of a team")
-    parser.add_argument(
-        "--env", type=filled_text, help="id of the environment, for the zip of a team that was saved from Python"
-    )
+    add_saved_team(parser)
     parser.add_argument("--agent", type=filled_text, help="agent to show at first; if left out, the one that sees others most")
     parser.add_argument("--episodes", type=positive_number, default=1, help="number of episodes to record")
     parser.add_argument("--stochastic", action="store_true", help="sample the actions instead of acting greedily")
