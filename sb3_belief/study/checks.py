@@ -4,7 +4,6 @@ import warnings
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig, find_config_file, load_config
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.preflight import (
+    agent_without_masks,
     check_copies,
     check_device,
     check_eval_env,
@@ -201,12 +201,10 @@ def _made_environment(config: RunConfig, seed: int, stack: ExitStack) -> TeamVec
 
 
 def _check_masks(config: RunConfig, env: TeamVecEnv, where: str) -> None:
-    masks = env.action_masks() or {}
-    for agent in env.possible_agents:
-        takes_masks = "action_masks" in signature(config.agent(agent).algo_class.predict).parameters
-        if takes_masks and agent not in masks:
-            name = config.agent(agent).algo
-            raise ConfigError(
-                f"{where}: {name} needs action masks, and {config.env_id} gives {agent!r} none: use"
-                f" {name.replace('maskable_', '')}."
-            )
+    agent = agent_without_masks(config, env)
+    if agent is not None:
+        name = config.agent(agent).algo
+        raise ConfigError(
+            f"{where}: {name} needs action masks, and {config.env_id} gives {agent!r} none: use"
+            f" {name.replace('maskable_', '')}."
+        )

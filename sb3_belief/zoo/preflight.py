@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import signature
 from pathlib import Path
 from typing import Any, cast
 
@@ -196,6 +197,22 @@ def check_step(config: RunConfig, env: TeamVecEnv) -> None:
         raise ConfigError(
             f"{config.origin('env_wrapper')}: env_wrapper: {config.env_id} cannot be stepped with it: {cause(error)}"
         ) from error
+
+
+def agent_without_masks(config: RunConfig, env: TeamVecEnv) -> str | None:
+    """
+    Return the first agent whose algorithm needs action masks and that the environment gives none.
+
+    :param config: The configuration
+    :param env: The environment, which has been reset
+    :return: Its name; None if there is none
+    """
+    masks = env.action_masks() or {}
+    for agent in env.possible_agents:
+        takes_masks = "action_masks" in signature(config.agent(agent).algo_class.predict).parameters
+        if takes_masks and agent not in masks:
+            return agent
+    return None
 
 
 def check_eval_env(config: RunConfig, env: TeamVecEnv, eval_env: TeamVecEnv) -> None:

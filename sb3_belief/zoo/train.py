@@ -3,7 +3,6 @@
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.util import find_spec
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from sb3_belief.zoo.endings import EndSignals
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.learning import RunCallbacks, learn_and_save
 from sb3_belief.zoo.preflight import (
+    agent_without_masks,
     check_copies,
     check_device,
     check_eval_env,
@@ -149,17 +149,15 @@ def _check_first_reset(config: RunConfig, env: TeamVecEnv) -> None:
     try:
         # The team seeds the environment once it is made, so that this reset changes nothing of the training
         env.reset()
-        masks = env.action_masks() or {}
+        agent = agent_without_masks(config, env)
     except Exception as error:
         raise ConfigError(f"{config.source}: {config.env_id} cannot be reset: {cause(error)}") from error
-    for agent in env.possible_agents:
-        takes_masks = "action_masks" in signature(config.agent(agent).algo_class.predict).parameters
-        if takes_masks and agent not in masks:
-            name = config.agent(agent).algo
-            raise ConfigError(
-                f"--algo: {name} needs action masks, and {config.env_id} gives {agent!r} none. Use"
-                f" {name.replace('maskable_', '')}, or give the masks in infos[agent]['action_mask']."
-            )
+    if agent is not None:
+        name = config.agent(agent).algo
+        raise ConfigError(
+            f"--algo: {name} needs action masks, and {config.env_id} gives {agent!r} none. Use"
+            f" {name.replace('maskable_', '')}, or give the masks in infos[agent]['action_mask']."
+        )
 
 
 def _check_options(config: RunConfig, options: TrainOptions) -> None:
