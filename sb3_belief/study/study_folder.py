@@ -10,10 +10,11 @@ import yaml
 
 from sb3_belief.common.durable_files import make_folder, replaced_file, sweep_temporary_files
 from sb3_belief.study.cell_record import CELLS, EPISODES_FILE, FAILED, FINISHED, FREE_OPTIONS, WAITING, Cell, all_cells
-from sb3_belief.study.specification import Study
+from sb3_belief.study.specification import TRAIN_KEYS, Study
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, reason_of, short
 from sb3_belief.zoo.run_folder import folder_name
+from sb3_belief.zoo.train_options import TrainOptions
 
 STUDY_FILE = "study.yml"
 # How many differences a message has
@@ -78,20 +79,9 @@ def cell_options(study: Study) -> dict[str, Any]:
     :param study: The study
     :return: Arguments of ``TrainOptions``
     """
-    defaults = {
-        "save_every": 600.0,
-        "save_freq": -1,
-        "device": "auto",
-        "num_threads": 1,
-        "jobs": 1,
-        "on_nan": "raise",
-        "vec_env": "dummy",
-        "step_timeout": -1.0,
-        "restart_workers": 0,
-    }
     evaluation = study.evaluation
     return {
-        **defaults,
+        **TrainOptions.defaults(TRAIN_KEYS),
         **study.train,
         "eval_freq": -1 if evaluation.online else evaluation.every,
         "eval_episodes": evaluation.episodes,

@@ -12,6 +12,7 @@ import yaml
 from sb3_belief.study.tuning_space import SearchSpace, parse_space
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
+from sb3_belief.zoo.train_options import TrainOptions
 from sb3_belief.zoo.yaml_data import merge, read_file
 
 #: Seed of the first run of a trial, far from those of studies: what is reported must not be what settings were chosen on
@@ -22,15 +23,7 @@ _EVALUATION = {"every": 25_000, "episodes": 32, "copies": 32}
 _SAMPLER = {"name": "tpe", "seed": 0, "startup_trials": 10}
 _PRUNER = {"name": "median", "startup_trials": 5, "warmup_evaluations": 1}
 # Options of ``TrainOptions`` that a tuning may set, and their defaults in it
-_TRAIN: dict[str, Any] = {
-    "device": "auto",
-    "num_threads": 1,
-    "jobs": 1,
-    "on_nan": "raise",
-    "vec_env": "dummy",
-    "step_timeout": -1.0,
-    "restart_workers": 0,
-}
+_TRAIN = TrainOptions.defaults(("device", "num_threads", "jobs", "on_nan", "vec_env", "step_timeout", "restart_workers"))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -69,6 +69,17 @@ class TrainOptions:
     trust: bool = False
     verbose: int = 1
     command: list[str] = field(default_factory=lambda: list(sys.argv))
+
+    @classmethod
+    def defaults(cls, names: Iterable[str]) -> dict[str, Any]:
+        """
+        Return the values that options have if nothing is said.
+
+        :param names: Their names
+        :return: {name: value}
+        """
+        options = cls()
+        return {name: getattr(options, name) for name in names}
 
     def to_record(self) -> dict[str, Any]:
         """
