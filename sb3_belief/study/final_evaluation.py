@@ -16,10 +16,8 @@ from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import cause
 from sb3_belief.zoo.evaluate import evaluate
-from sb3_belief.zoo.run_folder import TEAM, read_record
+from sb3_belief.zoo.run_folder import BEST_MODEL, EVALUATIONS, TEAM, read_record
 from sb3_belief.zoo.train import make_env
-
-EVALUATIONS, BEST_MODEL = "evaluations.npz", "best_model.zip"
 
 
 def final_seed(seed: int) -> int:

@@ -13,8 +13,7 @@ from sb3_belief.study.groups import labels
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.run_reading import RunData, read_run, run_folders
 from sb3_belief.zoo.errors import ConfigError, cause, short
-
-_EVALUATIONS = "evaluations.npz"
+from sb3_belief.zoo.run_folder import EVALUATIONS
 
 
 def reported_logs(folder: Path) -> Reported:
@@ -81,7 +80,7 @@ def _newest(runs: Sequence[ReportedRun]) -> dict[tuple[str, str, int | None], Re
 
 def _rows(run: ReportedRun, study: str) -> Iterator[dict[str, Any]]:
     """Iterate over the episodes of a run's evaluations."""
-    path = run.data.folder / _EVALUATIONS
+    path = run.data.folder / EVALUATIONS
     if not path.is_file():
         return
     try:
@@ -90,7 +89,7 @@ def _rows(run: ReportedRun, study: str) -> Iterator[dict[str, Any]]:
             successes = data["successes"] if "successes" in data else None
     # A damaged file makes zipfile and numpy raise whatever they raise
     except Exception as error:
-        raise ValueError(f"its {_EVALUATIONS} is damaged ({cause(error)})") from error
+        raise ValueError(f"its {EVALUATIONS} is damaged ({cause(error)})") from error
     for index, joint_steps in enumerate(steps):
         won = (
             None if successes is None or len(successes) <= index or len(successes[index]) != len(returns[index]) else successes

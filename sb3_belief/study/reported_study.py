@@ -10,11 +10,11 @@ import pyarrow as pa
 import yaml
 
 from sb3_belief.report.episodes import EPISODES, read_episodes_table
+from sb3_belief.study.cell_record import CELL_RECORD, CELLS, EPISODES_FILE
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.run_reading import DAMAGED, ERROR, RunData, read_run, run_folders
+from sb3_belief.study.study_folder import STUDY_FILE
 from sb3_belief.zoo.errors import ConfigError
-
-STUDY, CELLS, CELL, EPISODES_FILE = "study.yml", "cells", "cell.json", "episodes.parquet"
 
 
 def is_study(folder: Path) -> bool:
@@ -24,7 +24,7 @@ def is_study(folder: Path) -> bool:
     :param folder: The folder
     :return: Whether it has a study's file
     """
-    return (folder / STUDY).is_file()
+    return (folder / STUDY_FILE).is_file()
 
 
 def reported_study(folder: Path) -> Reported:
@@ -35,8 +35,8 @@ def reported_study(folder: Path) -> Reported:
     :return: What can be reported of it
     :raises ConfigError: If the study's file is damaged
     """
-    specification = _specification(folder / STUDY)
-    cells = sorted((folder / CELLS).glob(f"*/*/seed_*/{CELL}"))
+    specification = _specification(folder / STUDY_FILE)
+    cells = sorted((folder / CELLS).glob(f"*/*/seed_*/{CELL_RECORD}"))
     order = _names(specification.get("algorithms"))
     environments = _names(specification.get("environments"))
     seeds = specification.get("seeds")
@@ -93,7 +93,7 @@ def _specification(path: Path) -> dict[str, Any]:
 
 def _cell(folder: Path) -> tuple[ReportedRun, pa.Table | None]:
     """Return what the folder of a cell tells, and its episodes if it counts."""
-    record = _record(folder / CELL)
+    record = _record(folder / CELL_RECORD)
     newest = max(run_folders(folder), key=lambda path: path.stat().st_mtime, default=None)
     run = None if newest is None else read_run(newest)
     # A cell that is damaged is still told by its path

@@ -21,13 +21,15 @@ from sb3_belief.report.study_page.run_page import run_page
 from sb3_belief.report.study_page.runs import run_names
 from sb3_belief.report.study_page.sections import StudyPage
 from sb3_belief.report.study_page.text import result_sentences
+from sb3_belief.study.cell_record import EPISODES_FILE
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.reported_logs import reported_logs
-from sb3_belief.study.reported_study import EPISODES_FILE, is_study, reported_study
+from sb3_belief.study.reported_study import is_study, reported_study
 from sb3_belief.study.run_reading import diagnostic_series, evaluation_series
 from sb3_belief.zoo.errors import ConfigError, reason_of, short, unknown_setting
+from sb3_belief.zoo.run_folder import VIEWER
 
-RUNS, BUNDLE, VIEWER = "runs", "vega.js", "viewer.html"
+RUNS, BUNDLE = "runs", "vega.js"
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from sb3_belief.study.tuning_spec import TuningSpec
 from sb3_belief.study.tuning_storage import Storage
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of
 from sb3_belief.zoo.preflight import check_folder
+from sb3_belief.zoo.run_folder import EVALUATIONS
 from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train import train
 from sb3_belief.zoo.train_options import TrainOptions
@@ -244,7 +245,7 @@ def _train_seeds(
 
 
 def _score(run: Path, spec: TuningSpec) -> float:
-    with np.load(run / "evaluations.npz") as data:
+    with np.load(run / EVALUATIONS) as data:
         values = data["results" if spec.objective == "return" else "successes"]
     return float(np.mean(values[-spec.last_evaluations :]))
 

@@ -15,10 +15,10 @@ from typing import Any
 
 from sb3_belief.team import Team
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of, short
-from sb3_belief.zoo.model_card import BEST_MODEL, CardContent, model_card
+from sb3_belief.zoo.model_card import CardContent, model_card
 from sb3_belief.zoo.preflight import check_folder
-from sb3_belief.zoo.run_folder import CONFIG, RECORD, TEAM, find_team, read_record, run_of_record
-from sb3_belief.zoo.run_score import EVALUATIONS, run_scores
+from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, EVALUATIONS, RECORD, TEAM, find_team, read_record, run_of_record
+from sb3_belief.zoo.run_score import run_scores
 from sb3_belief.zoo.yaml_data import read_file
 
 CARD = "README.md"

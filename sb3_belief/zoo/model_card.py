@@ -4,11 +4,10 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_belief.zoo.run_folder import CONFIG, TEAM, folder_name
+from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, EVALUATIONS, TEAM, folder_name
 from sb3_belief.zoo.run_score import LEVEL, RunScore
 
 TAGS = ("reinforcement-learning", "deep-reinforcement-learning", "multi-agent", "stable-baselines3", "sb3-belief")
-BEST_MODEL = "best_model.zip"
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def _text(content: CardContent) -> str:
         **({BEST_MODEL: "the team that was best in an evaluation during the training"} if content.with_best else {}),
         CONFIG: "all settings, with which `sb3-belief train --conf-file` repeats the run",
         "run.json": "algorithm, environment, seed and versions",
-        **({"evaluations.npz": "the returns of all evaluations"} if content.scores is not None else {}),
+        **({EVALUATIONS: "the returns of all evaluations"} if content.scores is not None else {}),
     }
     parts = [
         f"# {repo_id.rpartition('/')[2]}",

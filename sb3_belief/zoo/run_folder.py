@@ -27,6 +27,10 @@ from sb3_belief.zoo.names import get_algo, load_env
 CONFIG = "config.yml"
 RECORD = "run.json"
 TEAM = "team.zip"
+BEST_MODEL = "best_model.zip"
+EVALUATIONS = "evaluations.npz"
+#: The belief viewer, once it has been written
+VIEWER = "viewer.html"
 CHECKPOINTS = "checkpoints"
 # How a run ended that can be continued, by its record
 UNFINISHED = ("running", "interrupted", "failed")

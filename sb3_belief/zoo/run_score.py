@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from sb3_belief.zoo.errors import ConfigError, cause
+from sb3_belief.zoo.run_folder import EVALUATIONS
 
-EVALUATIONS = "evaluations.npz"
 #: Share of repetitions in which an interval is to contain the mean
 LEVEL = 0.95
 _RESAMPLES = 10_000

@@ -11,10 +11,9 @@ from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.preflight import check_device, check_output
 from sb3_belief.zoo.replay import ShownTeam, environment_of, render_modes_of, team_in_its_environment, with_mode
-from sb3_belief.zoo.run_folder import RECORD, find_team
+from sb3_belief.zoo.run_folder import RECORD, VIEWER, find_team
 
 #: Name of the page in the folder of a run
-VIEWER = "viewer.html"
 # Data of a longer recording would make a page that browsers open slowly
 MOST_EPISODES = 20
 
