@@ -58,9 +58,11 @@ def test_every_page_stands_in_a_list_of_contents():
 
 
 def test_the_readme_stands_alone():
-    """A package index shows it beside no other file, and without anchors of its headings."""
+    """A package index shows it beside no other file, and without anchors of its headings: of pictures it shows the text."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert re.findall(r"\]\((?!https://)[^)]*\)", text) == [] and "<img" not in text
+    pictures = re.findall(r"!\[([^\]]*)\]\((?!https://)[^)]*\)", text)
+    assert len(re.findall(r"\]\((?!https://)[^)]*\)", text)) == len(pictures) and "<img" not in text
+    assert pictures and all(len(words.split()) > 10 for words in pictures)
 
 
 def test_the_readme_stays_short():
