@@ -14,7 +14,7 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yml"))
 
 
 def test_all_are_there():
-    assert NAMES == ["ablations", "convention", "lbf", "smac_paper", "smax", "traffic_junction"]
+    assert NAMES == ["ablations", "convention", "lbf", "smac_paper", "smax", "speaker_listener", "traffic_junction"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -27,7 +27,7 @@ def test_a_dry_run_of_each(name, tmp_path, capsys):
         # Never for another reason than an environment that is not here, and then all others have been checked
         assert status == 2 and "which is not installed" in captured.err
         assert captured.err.endswith("All that does not need it has been checked.\n")
-        assert name in ("lbf", "smac_paper", "smax")
+        assert name in ("lbf", "smac_paper", "smax", "speaker_listener")
     assert not list(tmp_path.iterdir())
 
 
