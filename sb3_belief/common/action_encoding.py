@@ -45,3 +45,35 @@ def action_encoding(name: str, space: spaces.Space) -> ActionEncoding:
         f"{name} has the action space {space}; a belief can be held about Discrete, MultiDiscrete, MultiBinary "
         "and Box actions. Flatten its action space in the environment."
     )
+
+
+class RowEncoder:
+    """
+    Encodes many values of a space at once, each as ``gymnasium.spaces.flatten`` encodes it.
+
+    :param name: Of the agent, for the error message
+    :param space: A Discrete, MultiDiscrete, MultiBinary or Box space
+    :raises ValueError: For another space
+    """
+
+    def __init__(self, name: str, space: spaces.Space):
+        encoding = action_encoding(name, space)
+        #: Width of a row
+        self.width = encoding.width
+        # The first column of the one-hot code of each discrete component
+        starts = np.concatenate([[0], np.cumsum(encoding.widths)[:-1]]).astype(int)
+        self._offsets = starts if encoding.kind == "categorical" else None
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """
+        Encode values.
+
+        :param values: ``[n, ...]``, each in the space
+        :return: float32 ``[n, width]``; these values themselves where they need no other form
+        """
+        rows = values.reshape(len(values), -1)
+        if self._offsets is None:
+            return rows.astype(np.float32, copy=False)
+        encoded = np.zeros((len(rows), self.width), dtype=np.float32)
+        encoded[np.arange(len(rows))[:, None], rows.astype(int) + self._offsets] = 1.0
+        return encoded

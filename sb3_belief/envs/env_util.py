@@ -1,6 +1,6 @@
 """Make the vectorised environment of a team from an id or from a PettingZoo environment of the user's own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -9,6 +9,7 @@ from pettingzoo import ParallelEnv
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.envs.registry import make_batched_env, spec
 from sb3_belief.vec_env.joint_env import JointEnv, Visibility
+from sb3_belief.vec_env.observe_last import ObserveLastVecEnv
 from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
@@ -23,6 +24,8 @@ def make_team_env(
     visibility: Visibility | None = None,
     step_timeout: float | None = None,
     restart_workers: int = 0,
+    observe_last: bool | Sequence[str] = False,
+    partner_starts: bool | Sequence[str] = False,
 ) -> TeamVecEnv:
     """
     Make ``n_envs`` copies of a team environment as one SB3 ``VecEnv``.
@@ -46,11 +49,15 @@ def make_team_env(
         an error, in a step or reset. The episode is cut off there (``TimeLimit.truncated``, ``worker_restarted`` in the info),
         with a warning. The new copy is seeded from the copy's seed and the number of its restarts; attributes that were set on
         the old one are lost. Copies are then stepped one by one even if the environment has a batched class
+    :param observe_last: Whether agents also observe their last step: the visible others' actions, their visibility, their own
+        action and reward, see ``ObserveLastVecEnv``. True for all agents, or the names of those that do
+    :param partner_starts: Whether agents are told where another partner has come, and observe their last step also over the
+        ends of episodes, for ``PartnerRecurrentPPO``. True for all agents, or the names of those that are
     :return: The vectorised environment
     :raises TypeError: If ``env`` is an environment instead of a callable that makes one
     :raises ValueError: For an unknown id, an unknown ``vec_env``, ``n_envs < 1``, a ``step_timeout`` that is not positive or
-        without worker processes, a negative ``restart_workers``, or ``visibility`` for an environment that has a method
-        ``visibility()``
+        without worker processes, a negative ``restart_workers``, ``visibility`` for an environment that has a method
+        ``visibility()``, unknown agents, or ``partner_starts`` for an environment that does not say which partner is there
     :raises ModuleNotFoundError: If the package of an id is not installed. The message has the line that installs it
     """
     if vec_env not in ("dummy", "subproc"):
@@ -78,6 +85,12 @@ def make_team_env(
     if team_env is None:
         make_copies = [partial(_make_joint, make_one, wrapper, visibility, copy) for copy in range(n_envs)]
         team_env = ParallelTeamVecEnv(make_copies, vec_env == "subproc", step_timeout, restart_workers)
+    if observe_last is not False or partner_starts is not False:
+        try:
+            team_env = ObserveLastVecEnv(team_env, observe_last, partner_starts)
+        except BaseException:
+            team_env.close()
+            raise
     if seed is not None:
         team_env.seed(seed)
     return team_env

@@ -1,0 +1,85 @@
+"""Base class of what is put around a team's vectorised environment and is itself one."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+
+
+class TeamVecEnvWrapper(TeamVecEnv):
+    """
+    A ``TeamVecEnv`` around another one, whose copies it resets and steps; it says what the one within says.
+
+    An SB3 ``VecEnvWrapper`` would do for one that leaves the spaces alone. A team reads its environment's agents and spaces
+    from the ``TeamVecEnv`` itself, so what changes these has to be one.
+
+    :param venv: The environment within
+    :param observation_spaces: Observation space of each agent, in place of that of ``venv``
+    """
+
+    def __init__(self, venv: TeamVecEnv, observation_spaces: Mapping[str, spaces.Space]):
+        #: The environment within
+        self.venv = venv
+        acted: Any = venv.action_space
+        agents = venv.possible_agents
+        super().__init__(
+            venv.num_envs,
+            agents,
+            observation_spaces,
+            {agent: acted[agent] for agent in agents},
+            render_mode=venv.render_mode,
+            scripted_action_spaces=venv.scripted_action_spaces,
+        )
+        self.reports_success = venv.reports_success
+
+    @property
+    def n_restarts(self) -> int:
+        """How often copies have been made anew after a fault."""
+        return getattr(self.venv, "n_restarts", 0)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        return self.venv.seed(seed)
+
+    def set_options(self, options: list[dict] | dict | None = None) -> None:
+        self.venv.set_options(options)
+
+    def action_masks(self) -> dict[str, np.ndarray] | None:
+        return self.venv.action_masks()
+
+    def close(self) -> None:
+        super().close()
+        self.venv.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return self.venv.get_images()
+
+    def has_attr(self, attr_name: str) -> bool:
+        return self.venv.has_attr(attr_name)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return self.venv.get_attr(attr_name, indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        self.venv.set_attr(attr_name, value, indices)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    def _reset_joint(self) -> TeamObs:
+        return self.venv.reset()
+
+    def _step_joint(self, actions: TeamObs) -> TeamStep:
+        # The one within counts its steps and episodes, too: its error messages say where something went wrong
+        return self.venv.step(actions)
+
+    def _copies_state(self) -> dict[str, Any]:
+        return self.venv.exact_state()
+
+    def _set_copies_state(self, state: dict[str, Any]) -> None:
+        self.venv.set_exact_state(state)
