@@ -3,7 +3,8 @@
 from sb3_belief.envs.env_util import make_team_env
 from sb3_belief.team.checkpoints import Checkpoints
 from sb3_belief.team.finite import NonFiniteError
-from sb3_belief.team.fixed_partners import AgentEnv
+from sb3_belief.team.fixed_partners import AgentEnv, ObserveLast
+from sb3_belief.team.recurrent import PartnerRecurrentPPO
 from sb3_belief.team.team import Team
 from sb3_belief.vec_env import JointEnv, ParallelTeamVecEnv, TeamVecEnv
 
@@ -12,7 +13,9 @@ __all__ = [
     "Checkpoints",
     "JointEnv",
     "NonFiniteError",
+    "ObserveLast",
     "ParallelTeamVecEnv",
+    "PartnerRecurrentPPO",
     "Team",
     "TeamVecEnv",
     "make_team_env",
