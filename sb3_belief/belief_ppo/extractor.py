@@ -157,8 +157,15 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :param actions: The others' actions at those steps, ``[N, W]``, zero where not visible
         """
         if self.history is not None:
-            history = append_rows(self.history, observations, actions)
-            self.history_observations, self.history_actions, self.history_valid = history
+            self.restore_history(append_rows(self.history, observations, actions))
+
+    def restore_history(self, history: History) -> None:
+        """
+        Replace the history.
+
+        :param history: Another one of the same shapes
+        """
+        self.history_observations, self.history_actions, self.history_valid = history
 
     def forward(
         self, observations: th.Tensor | TensorDict, belief_pass: BeliefPass | None = None

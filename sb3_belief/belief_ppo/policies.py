@@ -114,6 +114,14 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
 
+    def restore_history(self, history: History) -> None:
+        """
+        Put an earlier history back, to forget what was remembered since.
+
+        :param history: A value that :attr:`history` had
+        """
+        self._extractor.restore_history(history)
+
     def remember(
         self,
         observations: np.ndarray | dict[str, np.ndarray],

@@ -23,6 +23,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--deterministic", dest="deterministic", action="store_true", default=True, help="act greedily (default)"
     )
     manner.add_argument("--stochastic", dest="deterministic", action="store_false", help="sample the actions")
+    parser.add_argument(
+        "--observe", action="store_true", help="let beliefs remember what the others do here; nothing is saved of it"
+    )
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the environment and of sampled actions")
     parser.add_argument("--output", type=new_path, help=".gif or .mp4 file to write; if left out, a window is opened")
     parser.add_argument(
@@ -41,7 +44,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
-    names = "run env trust episodes n_timesteps deterministic seed output fps device"
+    names = "run env trust episodes n_timesteps deterministic seed output fps device observe"
     enjoy(
         EnjoyOptions(
             **{name: getattr(args, name) for name in names.split()},

@@ -4,6 +4,7 @@ from sb3_belief.envs.env_util import make_team_env
 from sb3_belief.team.checkpoints import Checkpoints
 from sb3_belief.team.finite import NonFiniteError
 from sb3_belief.team.fixed_partners import AgentEnv, ObserveLast
+from sb3_belief.team.observing import observing
 from sb3_belief.team.recurrent import PartnerRecurrentPPO
 from sb3_belief.team.team import Team
 from sb3_belief.vec_env import JointEnv, ParallelTeamVecEnv, TeamVecEnv
@@ -19,4 +20,5 @@ __all__ = [
     "Team",
     "TeamVecEnv",
     "make_team_env",
+    "observing",
 ]

@@ -1,6 +1,7 @@
 """Replay of a trained team, in a window or as a GIF or MP4 file."""
 
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.report.frames import NoPictureError, frame_of
-from sb3_belief.team import Team, TeamVecEnv
+from sb3_belief.team import Team, TeamVecEnv, observing
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import Outcome
 from sb3_belief.zoo.preflight import check_device, check_output
@@ -36,6 +37,7 @@ class EnjoyOptions(ShownTeam):
     :param seed: Seed of the environment, and of what the agents sample
     :param output: Path of a ``.gif`` or ``.mp4`` file, or None for a window
     :param fps: Frames per second of the file, or None for the environment's own rate
+    :param observe: Whether the agents observe, so that their beliefs adapt to those whom they meet here
     """
 
     episodes: int = 1
@@ -44,6 +46,7 @@ class EnjoyOptions(ShownTeam):
     seed: int = 0
     output: str | None = None
     fps: int | None = None
+    observe: bool = False
 
 
 def enjoy(options: EnjoyOptions) -> Outcome:
@@ -61,9 +64,17 @@ def enjoy(options: EnjoyOptions) -> Outcome:
     check_device(options.device)
     path = find_team(options.run, "enjoy")
     shown = _with_render_mode(environment_of(path, options, "enjoy"), options)
-    with team_in_its_environment(path, shown, options, options.seed, "enjoy") as (team, env):
+    with team_in_its_environment(path, shown, options, options.seed, "enjoy") as (team, env), ExitStack() as stack:
         frames: list[np.ndarray] | None = None if options.output is None else []
-        outcome = _play(team, env, options, frames)
+        played: Any = env
+        if options.observe:
+            try:
+                played = stack.enter_context(observing(team, env))
+            except ValueError as error:
+                raise ConfigError(f"--observe: {error}") from error
+        outcome = _play(team, played, options, frames)
+        if options.observe:
+            print("Observed steps: " + ", ".join(f"{agent} {n}" for agent, n in played.steps.items()))
         if options.output is not None and frames:
             write_video(Path(options.output), frames, options.fps or shown.frame_rate)
             print(f"Wrote {len(frames)} frames to {options.output}")

@@ -1,0 +1,181 @@
+"""Agents that observe while they are evaluated: what they see goes into their histories, and no weight changes."""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+from sb3_belief.team.arguments import check_team_vec_env
+from sb3_belief.team.team import Team
+from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
+from sb3_belief.vec_env.observation_forms import map_parts
+from sb3_belief.vec_env.team_vec_env import TeamVecEnv
+
+
+class _Seen(NamedTuple):
+    """What an agent observed of a step: its observations when it acted, the others' actions ``[n, W]``, and where it acted."""
+
+    obs: Any
+    others_actions: np.ndarray
+    active: np.ndarray
+
+
+class ObservingVecEnv(VecEnvWrapper):
+    """
+    Environment that hands agents what they observe of each step, in all copies at once, as long as it is open.
+
+    Made by :func:`observing`. A step is in an agent's history before it acts next, so what it does at step t + 1 may follow
+    from what the others did at step t, in this copy or another.
+
+    :param venv: The environment
+    :param policies: The policies that have a history, by agent
+    :param most_steps: How many steps each agent observes at most; None without a limit
+    """
+
+    def __init__(self, venv: VecEnv, policies: Mapping[str, BeliefPolicyMixin], most_steps: int | None):
+        super().__init__(venv)
+        self._policies, self._most_steps = policies, most_steps
+        #: How many steps each agent has observed: those in which it was in play, of all copies together
+        self.steps = dict.fromkeys(policies, 0)
+        #: Whether steps are observed; set to False to go on without
+        self.is_open = True
+        self._obs: Any = None
+        self._actions: Any = None
+
+    def reset(self) -> Any:
+        """
+        Reset all copies.
+
+        :return: As of the environment within
+        """
+        self._obs = self.venv.reset()
+        return self._obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """
+        Step all copies, and let the agents remember what they observed of it.
+
+        :return: As of the environment within
+        :raises RuntimeError: If it was not reset by this one
+        """
+        if self._obs is None:
+            raise RuntimeError("An environment in which agents observe has to be reset before it is stepped.")
+        step: Any = self.venv.step_wait()
+        if self.is_open:
+            for agent, seen in self._seen(step).items():
+                self._remember(agent, seen)
+        self._obs = step[0]
+        return step
+
+    @abstractmethod
+    def _seen(self, step: Any) -> dict[str, _Seen]:
+        """Return what each agent observed of a step."""
+
+    def _remember(self, agent: str, seen: _Seen) -> None:
+        rows = np.flatnonzero(seen.active)
+        if self._most_steps is not None:
+            rows = rows[: self._most_steps - self.steps[agent]]
+        if len(rows):
+            self._policies[agent].remember(map_parts(lambda part: part[rows], seen.obs), seen.others_actions[rows])
+            self.steps[agent] += len(rows)
+
+
+class _ObservingTeam(ObservingVecEnv):
+    def __init__(self, venv: VecEnv, policies: Mapping[str, BeliefPolicyMixin], most_steps: int | None, team: Team):
+        super().__init__(venv, policies, most_steps)
+        team_env: Any = venv.unwrapped
+        acted: Any = venv.action_space
+        self._team, self._agents = team, team_env.possible_agents
+        actions = {agent: acted[agent] for agent in self._agents}
+        self._splitter = TransitionSplitter(self._agents, actions, team_env.scripted_action_spaces)
+
+    def _seen(self, step: Any) -> dict[str, _Seen]:
+        transitions = dict(zip(self._agents, self._splitter.transitions(self._actions, step), strict=True))
+        return {
+            agent: _Seen(
+                self._team.observed_by(agent, self._obs[agent]), transitions[agent].others_actions, transitions[agent].active
+            )
+            for agent in self._policies
+        }
+
+
+class _ObservingLearner(ObservingVecEnv):
+    def _seen(self, step: Any) -> dict[str, _Seen]:
+        infos = step[3]
+        try:
+            others_actions = np.stack([info["others_actions"] for info in infos])
+            active = np.array([info["active"] for info in infos])
+        except KeyError as error:
+            raise ValueError(
+                f"The infos of the environment lack {error.args[0]!r}, so there is nothing to observe: use an AgentEnv."
+            ) from None
+        return {agent: _Seen(self._obs, others_actions, active) for agent in self._policies}
+
+
+@contextmanager
+def observing(model: Any, env: VecEnv, most_steps: int | None = None) -> Iterator[ObservingVecEnv]:
+    """
+    Let agents observe while they act in an environment, as they do when they are deployed::
+
+        with observing(team, env) as watched:
+            evaluate_policy(team, watched)
+
+    Each step in which an agent is in play is appended to its history: its observation, and the actions of the others that it
+    could see. Nothing else of the environment is read, no weight changes and no random number is drawn. Afterwards every
+    history is what it was before.
+
+    :param model: A ``Team``, or a single SB3 model of ours that acts in a vectorised :class:`AgentEnv`
+    :param env: The environment in which it is evaluated, with any number of copies, which all fill the same history of an
+        agent. For a single model with all wrappers of its observations, such as ``VecNormalize``
+    :param most_steps: How many steps each agent observes at most, at least 0: exactly as many, if as many are played. None
+        without a limit
+    :return: The environment to evaluate in. Its ``steps`` says how many steps each agent has observed; those of a single
+        model have the name of the learner. While its ``is_open`` is set to False, nothing is observed
+    :raises TypeError: If ``model`` is neither a team nor a model, or the environment is not one of a team
+    :raises ValueError: If no agent has a belief that a history feeds, if the environment has other agents than the team, or
+        for a negative ``most_steps``
+    """
+    if most_steps is not None and (isinstance(most_steps, bool) or not isinstance(most_steps, int) or most_steps < 0):
+        raise ValueError(f"most_steps={most_steps!r} must be a number of steps of at least 0, or None for no limit.")
+    if isinstance(model, Team):
+        team_env: Any = check_team_vec_env(env).unwrapped
+        if team_env.possible_agents != model.possible_agents:
+            raise ValueError(f"The team has the agents {model.possible_agents}, the environment {team_env.possible_agents}.")
+        models = dict(model.agents)
+    elif isinstance(model, BaseAlgorithm):
+        if isinstance(env.unwrapped, TeamVecEnv):
+            raise TypeError("A single model observes in a vectorised AgentEnv; this is the environment of a team.")
+        models = {env.get_attr("agent")[0] if env.has_attr("agent") else "agent": model}
+    else:
+        raise TypeError(f"A Team or an SB3 model can observe, not a {type(model).__name__}.")
+    policies = {agent: each.policy for agent, each in models.items() if isinstance(each.policy, BeliefPolicyMixin)}
+    histories = {agent: policy.history for agent, policy in policies.items()}
+    policies = {agent: policy for agent, policy in policies.items() if histories[agent] is not None}
+    if not policies:
+        found = ", ".join(f"{agent}: {type(each).__name__}" for agent, each in models.items())
+        raise ValueError(
+            "Nobody here has a belief that a history feeds, so observing would change nothing: it takes a BeliefPPO with"
+            f" belief='dynamic' or 'context' and others to observe. The models are {found}."
+        )
+    observed: ObservingVecEnv
+    if isinstance(model, Team):
+        observed = _ObservingTeam(env, policies, most_steps, model)
+    else:
+        observed = _ObservingLearner(env, policies, most_steps)
+    try:
+        yield observed
+    finally:
+        observed.is_open = False
+        for agent, policy in policies.items():
+            history = histories[agent]
+            assert history is not None
+            policy.restore_history(history)
