@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import get_algo, get_env, load_env
-from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker
+from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker, observation_arguments
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
 DEFAULT = "default"
@@ -65,6 +65,8 @@ class RunConfig:
     :param env_kwargs: Argument of ``make_team_env``
     :param wrapper: Argument of ``make_team_env``: a function that applies the wrappers of ``env_wrapper``, or None
     :param visibility: Argument of ``make_team_env``: the function that ``visibility`` names, or None
+    :param observation: Arguments of ``make_team_env`` that say what agents observe besides: ``observe_last`` and
+        ``partner_starts``
     :param callbacks: Callback classes and their arguments
     :param algo_kwargs: Constructor arguments of each agent's algorithm
     :param eval_env_kwargs: Arguments of the environment of evaluations, which override ``env_kwargs``
@@ -84,6 +86,7 @@ class RunConfig:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     wrapper: Callable[[Any], Any] | None = None
     visibility: Callable[[Any], Any] | None = None
+    observation: dict[str, Any] = field(default_factory=dict)
     callbacks: tuple[tuple[type[BaseCallback], dict[str, Any]], ...] = ()
     algo_kwargs: dict[str, Any] = field(default_factory=dict)
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -167,7 +170,7 @@ def load_config(
     :return: The configuration
     :raises ConfigError: For a setting that does not fit. The message names its location, what is allowed and the nearest match
     """
-    chosen = get_algo(algo)
+    get_algo(algo)
     make_env = load_env(env_id, "--env", extra_packages)
     path = find_config_file(algo, conf_file)
     sections = read_file(path)
@@ -195,9 +198,11 @@ def load_config(
             raise ConfigError(f"{location.text}: must be a mapping of settings, not {short(layer)}.")
 
     n_leading, policy = len(get_env(env_id, "--env").leading), _last(layers, "policy")[1]
+    span_source, span = _last(layers, "memory_span")
+    chosen = get_algo(algo, f"{span_source}: memory_span", span)
     agents = {}
     for agent, own in _agent_settings(layers).items():
-        own_algo = get_algo(own.get("algo", algo), f"{_last(layers, 'agent_kwargs')[0]}: agent_kwargs: {agent}: algo")
+        own_algo = get_algo(own.get("algo", algo), f"{_last(layers, 'agent_kwargs')[0]}: agent_kwargs: {agent}: algo", span)
         agents[agent] = SettingsChecker(own_algo, make_env, n_leading, own.get("policy", policy))
     checker = SettingsChecker(chosen, make_env, n_leading, policy, agents)
     settings: dict[str, Any] = {}
@@ -326,20 +331,25 @@ def _to_run_config(
         env_kwargs=checked.get("env_kwargs", {}),
         wrapper=partial(_wrap, wrappers=wrappers) if wrappers else None,
         visibility=checked.get("visibility"),
+        observation=observation_arguments(checked),
         callbacks=checked.get("callback", ()),
         algo_kwargs=algo_kwargs,
         eval_env_kwargs=checked.get("eval_env_kwargs", {}),
         agents={
-            agent: _agent_config(agent, own, AgentConfig(algo, algo_class, checked["policy"], algo_kwargs), origins)
+            agent: _agent_config(
+                agent, own, AgentConfig(algo, algo_class, checked["policy"], algo_kwargs), origins, checked.get("memory_span")
+            )
             for agent, own in checked.get("agent_kwargs", {}).items()
         },
         origins=origins,
     )
 
 
-def _agent_config(agent: str, own: dict[str, Any], common: AgentConfig, origins: dict[str, str]) -> AgentConfig:
+def _agent_config(
+    agent: str, own: dict[str, Any], common: AgentConfig, origins: dict[str, str], memory_span: str | None
+) -> AgentConfig:
     name = own.get("algo", common.algo)
-    algo = get_algo(name)
+    algo = get_algo(name, memory_span=memory_span)
     algo_class, policy = algo.load(), own.get("policy", common.policy)
     if policy not in algo_class.policy_aliases:
         raise ConfigError(

@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, EVALUATIONS, TEAM, folder_name
 from sb3_belief.zoo.run_score import LEVEL, RunScore
+from sb3_belief.zoo.settings import observation_arguments
 
 TAGS = ("reinforcement-learning", "deep-reinforcement-learning", "multi-agent", "stable-baselines3", "sb3-belief")
 
@@ -127,7 +128,8 @@ def usage(content: CardContent) -> str:
     :param content: What the card says
     """
     kwargs = content.settings.get("env_kwargs", {})
-    arguments = f", env_kwargs={kwargs!r}" if kwargs else ""
+    given = {**({"env_kwargs": kwargs} if kwargs else {}), **observation_arguments(content.settings)}
+    arguments = "".join(f", {name}={value!r}" for name, value in given.items())
     wrapped = content.settings.get("env_wrapper") or content.settings.get("visibility")
     note = (
         f"# {CONFIG} names wrappers, which sb3-belief enjoy applies, and make_team_env(wrapper=...) takes\n" if wrapped else ""

@@ -7,7 +7,7 @@ Algorithms have short names. Classes, wrappers, functions and callbacks are name
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -47,10 +47,13 @@ class Algo:
 
     :param path: ``"module:class"``, which is imported when the algorithm is used
     :param fixed: Constructor arguments that the name implies. A configuration cannot change them
+    :param partner_memory: ``"module:class"`` of the same with a memory that lasts as long as a partner stays; empty if there
+        is none
     """
 
     path: str
     fixed: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    partner_memory: str = ""
 
     def load(self) -> type[BaseAlgorithm]:
         """
@@ -75,7 +78,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "td3": Algo("stable_baselines3:TD3"),
         "sac": Algo("stable_baselines3:SAC"),
         "maskable_ppo": Algo("sb3_contrib:MaskablePPO"),
-        "recurrent_ppo": Algo("sb3_contrib:RecurrentPPO"),
+        "recurrent_ppo": Algo("sb3_contrib:RecurrentPPO", partner_memory="sb3_belief.team.recurrent:PartnerRecurrentPPO"),
         "trpo": Algo("sb3_contrib:TRPO"),
         "qrdqn": Algo("sb3_contrib:QRDQN"),
         "tqc": Algo("sb3_contrib:TQC"),
@@ -84,18 +87,25 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
 )
 
 
-def get_algo(name: str, where: str = "--algo") -> Algo:
+def get_algo(name: str, where: str = "--algo", memory_span: Any = None) -> Algo:
     """
     Return the algorithm that a short name stands for.
 
     :param name: A key of ``ALGOS``
     :param where: File, section and key, or flag, for the error message
+    :param memory_span: ``"partner"`` for an algorithm whose memory lasts as long as a partner stays
     :return: The algorithm
-    :raises ConfigError: For another name
+    :raises ConfigError: For another name, or one without such a memory
     """
     if not isinstance(name, str) or name not in ALGOS:
         raise unknown_setting(where, "algorithm", name, ALGOS)
-    return ALGOS[name]
+    algo = ALGOS[name]
+    if memory_span != "partner":
+        return algo
+    if not algo.partner_memory:
+        able = ", ".join(each for each, other in ALGOS.items() if other.partner_memory)
+        raise ConfigError(f"{where}: {name} has no memory, so memory_span: partner is not for it. Allowed: {able}.")
+    return replace(algo, path=algo.partner_memory)
 
 
 def resolve(path: Any, where: str, extra_packages: tuple[str, ...] = ()) -> Callable[..., Any]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +49,14 @@ class ShownEnvironment:
     :param env_kwargs: Its arguments
     :param wrapper: Argument of ``make_team_env``
     :param frame_rate: Frames per second
+    :param observation: Further arguments of it: what agents observe besides
     """
 
     env_id: str
     env_kwargs: dict[str, Any]
     wrapper: Callable[[Any], Any] | None
     frame_rate: int = 10
+    observation: dict[str, Any] = field(default_factory=dict)
 
 
 def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironment:
@@ -84,7 +86,7 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     check_record(run, packages, trust=saved.trust)
     folder = None if saved.trust else conf_file.parent
     config = load_config(algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder)
-    return ShownEnvironment(config.env_id, config.env_kwargs, config.wrapper)
+    return ShownEnvironment(config.env_id, config.env_kwargs, config.wrapper, observation=config.observation)
 
 
 def render_modes_of(shown: ShownEnvironment, command: str) -> tuple[ShownEnvironment, list[str]]:
@@ -134,7 +136,7 @@ def team_in_its_environment(
     :raises ConfigError: If the environment refuses its settings, or the team cannot be loaded
     """
     with _refusals_as_config_errors(shown, command):
-        env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
+        env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper, **shown.observation)
     try:
         try:
             trust = Trust.of(saved.trust, saved.extra_packages)

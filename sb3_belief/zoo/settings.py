@@ -26,6 +26,8 @@ RUN_KEYS: dict[str, Any] = {
     "normalize": bool | dict[str, Any],
     "env_wrapper": str | list[Any] | dict[str, Any] | None,
     "visibility": str | dict[str, Any] | None,
+    "observe_last": bool | list[str],
+    "memory_span": str,
     "env_kwargs": dict[str, Any],
     "eval_env_kwargs": dict[str, Any],
     "callback": str | list[Any] | dict[str, Any] | None,
@@ -33,6 +35,9 @@ RUN_KEYS: dict[str, Any] = {
 }
 # The settings that agent_kwargs may give a single agent, besides the arguments of its algorithm
 _AGENT_KEYS = {"algo": str, "policy": str, "policy_kwargs": dict[str, Any]}
+
+#: How long a recurrent agent remembers: sb3-contrib's own to the end of an episode
+MEMORY_SPANS = ("episode", "partner")
 
 _FLAGS = {
     "algo": "use the flag --algo, or for single agents agent_kwargs: {<agent>: {algo: <name>}}",
@@ -121,6 +126,8 @@ class SettingsChecker:
             check_limits({key: value}, location.parent)
         if key == "agent_kwargs":
             return {agent: self.agents[agent]._check_agent(own, location.key(agent)) for agent, own in value.items()}
+        if key == "memory_span" and value not in MEMORY_SPANS:
+            raise unknown_setting(location.text, "memory span", value, MEMORY_SPANS)
         if key == "policy" and value not in self.policies:
             raise unknown_setting(location.text, "policy", value, self.policies)
         if key == "policy_kwargs" and self.policy_class is not None:
@@ -165,6 +172,19 @@ class SettingsChecker:
                 check_run_file(function, arguments, location.key(path))
                 calls.append((function, arguments))
         return calls
+
+
+def observation_arguments(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return what settings say of what agents observe besides.
+
+    :param settings: Those of a run
+    :return: Arguments of ``make_team_env``; none where the settings say nothing, so that the environment is what it is
+    """
+    observe_last = settings.get("observe_last", False)
+    # Names in observe_last are those of the agents that learn: their memories are meant, too
+    told = (observe_last or True) if settings.get("memory_span") == "partner" else False
+    return {name: value for name, value in (("observe_last", observe_last), ("partner_starts", told)) if value}
 
 
 def _check_callback(callback: Any, location: Location) -> None:

@@ -200,6 +200,7 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy", 
             env_kwargs=config.env_kwargs,
             wrapper=config.wrapper,
             visibility=config.visibility,
+            **config.observation,
             **faults,
         )
     # An environment of the user's own may raise anything, and any settings may be more than the memory holds
