@@ -34,22 +34,22 @@ def partner_team(env=None, **kwargs):
 
 
 class AtRolloutEnd(BaseCallback):
-    """Callback that calls a function with the model of the guest before it trains on a rollout."""
+    """Callback that calls a function with the guest's model and the rollout's steps before the model trains on them."""
 
     model: Any
 
     def __init__(self, function):
         super().__init__()
         self.function = function
-        self.dones: list[np.ndarray] = []
+        self.steps: list[Any] = []
 
     def _on_step(self):
-        self.dones.append(self.locals["dones"].copy())
+        self.steps.append((self.locals["rewards"].copy(), self.locals["dones"].copy(), list(self.locals["infos"])))
         return True
 
     def _on_rollout_end(self):
-        self.function(self.model.agents["guest"], np.array(self.dones))
-        self.dones.clear()
+        self.function(self.model.agents["guest"], *zip(*self.steps, strict=True))
+        self.steps.clear()
 
 
 def test_training_sees_the_states_of_the_rollout_and_the_first_ratio_is_one(monkeypatch):
@@ -80,13 +80,13 @@ def test_training_sees_the_states_of_the_rollout_and_the_first_ratio_is_one(monk
 
     original = PartnerRecurrentPPO.train
     monkeypatch.setattr(PartnerRecurrentPPO, "train", train)
-    evaluate = RecurrentPPO.train
+    stock = RecurrentPPO.train
 
     def before_updates(self):
         np.random.seed(7)
         for data in self.rollout_buffer.get(self.batch_size):
             check(self.policy, data)
-        evaluate(self)
+        stock(self)
 
     monkeypatch.setattr(RecurrentPPO, "train", before_updates)
     partner_team().learn(3 * 64)
@@ -99,20 +99,24 @@ def test_training_sees_the_states_of_the_rollout_and_the_first_ratio_is_one(monk
 def test_returns_end_with_episodes_and_are_bootstrapped_at_limits():
     checked = []
 
-    def check(model, dones):
-        buffer = model.rollout_buffer
+    def check(model, rewards, dones, infos):
+        buffer, rewards, dones = model.rollout_buffer, np.array(rewards), np.array(dones)
         np.testing.assert_array_equal(buffer.episode_starts[1:], dones[:-1])
-        # The episodes end by truncation, so that SB3 has added the discounted value of the last observation to the rewards
-        added = buffer.rewards - np.round(buffer.rewards.clip(0, 1)) if (buffer.rewards >= 0).all() else buffer.rewards
-        assert (added[dones] != 0).all()
-        values = np.concatenate([buffer.values, np.zeros_like(buffer.values[:1])])
-        expected = np.zeros_like(buffer.values)
-        for t in reversed(range(buffer.buffer_size - 1)):
-            going_on = ~dones[t]
-            delta = buffer.rewards[t] + model.gamma * values[t + 1] * going_on - values[t]
-            later = expected[t + 1] if t + 2 < buffer.buffer_size else buffer.advantages[t + 1]
-            expected[t] = delta + model.gamma * model.gae_lambda * going_on * later
-        np.testing.assert_allclose(buffer.advantages[:-1], expected[:-1], atol=1e-5)
+        np.testing.assert_array_equal(buffer.rewards[~dones], rewards[~dones])
+        # All copies end together, by truncation: the value of the last observation, with the memory that there is then
+        for t in np.flatnonzero(dones[:-1, 0]):
+            last = [info["terminal_observation"]["guest"] for info in infos[t]]
+            obs = {key: th.as_tensor(np.stack([row[key] for row in last])) for key in last[0]}
+            memory = tuple(th.as_tensor(states[t + 1]) for states in (buffer.hidden_states_vf, buffer.cell_states_vf))
+            with th.no_grad():
+                values = model.policy.predict_values(obs, memory, th.zeros(4)).numpy()[:, 0]
+            np.testing.assert_allclose(buffer.rewards[t], rewards[t] + model.gamma * values, atol=1e-5)
+        # GAE by hand, from the true ends
+        expected = buffer.advantages[-1]
+        for t in reversed(range(len(dones) - 1)):
+            delta = buffer.rewards[t] + model.gamma * buffer.values[t + 1] * ~dones[t] - buffer.values[t]
+            expected = delta + model.gamma * model.gae_lambda * ~dones[t] * expected
+            np.testing.assert_allclose(buffer.advantages[t], expected, atol=1e-5)
         checked.append(dones.sum())
 
     partner_team().learn(2 * 64, callback=AtRolloutEnd(check))

@@ -27,7 +27,7 @@ def words(folder, algo, env_id, total, *params):
 
 
 def test_a_run_trains_evaluates_resumes_and_is_shown(tmp_path, capsys):
-    params = ("observe_last:true", "memory_span:partner", "policy_kwargs.lstm_hidden_size:8")
+    params = ("observe_last:true", "memory_span:partner", "policy_kwargs.lstm_hidden_size:8", "learning_rate:1e-3")
     for folder, total in (("whole", 96), ("parts", 64)):
         assert train_main(words(tmp_path / folder, "recurrent_ppo", GUEST, total, *params)) == 0
     whole, parts = run_folder(tmp_path / "whole"), run_folder(tmp_path / "parts")
