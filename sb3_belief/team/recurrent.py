@@ -8,6 +8,7 @@ from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentMultiInputActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_belief.vec_env.observe_last import MEMORY_START
 
@@ -29,7 +30,9 @@ class PartnerMemoryPolicy(RecurrentMultiInputActorCriticPolicy):
     So the memory is the same wherever the policy acts: in training, in evaluations, as a partner, and when it is deployed.
     """
 
-    def forward(self, obs: Any, lstm_states: Any, episode_starts: th.Tensor, deterministic: bool = False) -> Any:
+    def forward(  # type: ignore[override]
+        self, obs: Any, lstm_states: Any, episode_starts: th.Tensor, deterministic: bool = False
+    ) -> Any:
         return super().forward(obs, lstm_states, memory_starts(obs), deterministic)
 
     def get_distribution(self, obs: Any, lstm_states: Any, episode_starts: th.Tensor) -> Any:  # type: ignore[override]
@@ -80,5 +83,13 @@ class PartnerRecurrentPPO(RecurrentPPO):
         buffer.episode_starts = buffer.observations[MEMORY_START][..., 0].astype(np.float32)
         super().train()
 
-    def learn(self, total_timesteps: int, *args: Any, tb_log_name: str = "PartnerRecurrentPPO", **kwargs: Any) -> Any:
-        return super().learn(total_timesteps, *args, tb_log_name=tb_log_name, **kwargs)
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "PartnerRecurrentPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Any:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked
 from stable_baselines3.common.evaluation import evaluate_policy
-
-from sb3_belief.team import TeamVecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 
 @dataclass(frozen=True)
@@ -36,12 +35,12 @@ class Outcome:
         return None if rate is None else float(np.sqrt(rate * (1 - rate) / self.successes.size))
 
 
-def evaluate(model: Any, env: TeamVecEnv, n_episodes: int, deterministic: bool = True) -> Outcome:
+def evaluate(model: Any, env: VecEnv, n_episodes: int, deterministic: bool = True) -> Outcome:
     """
     Play episodes from a reset on and return their results.
 
     :param model: A ``Team``, or any object with a ``predict`` like its own
-    :param env: Environment to play in
+    :param env: Environment of the team to play in, with or without wrappers
     :param n_episodes: Number of episodes. Each copy plays the same share of them, so that short episodes are not preferred
     :param deterministic: Whether the agents act greedily. Otherwise they sample their actions
     :return: The results

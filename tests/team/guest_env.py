@@ -54,7 +54,7 @@ class GuestEnv(ParallelEnv):
         self.t += 1
         over = self.t == 2
         reward = float(actions["guest"] == self.host)
-        result = self.observations(), {"guest": reward}, {"guest": False}, {"guest": over}, {"guest": {}}
+        result: Any = self.observations(), {"guest": reward}, {"guest": False}, {"guest": over}, {"guest": {}}
         if over:
             self.agents = []
         return result

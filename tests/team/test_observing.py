@@ -12,11 +12,14 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief import BeliefPPO
-from sb3_belief.team import AgentEnv, observing
+from sb3_belief import team as sb3_team
+from sb3_belief.team import AgentEnv
 from sb3_belief.zoo.evaluate import evaluate
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 from tests.team.toy_envs import BlinkingEnv, MaskedEnv, ScriptedEnv, ToyEnv
 
+# Typed as Any, since a team's environment is stepped by a dict
+observing: Any = sb3_team.observing
 BELIEF = {**PPO_KWARGS, "history_length": 60}
 # The YAML entry of the conventions, which is trained for 60 of its 100 rollouts
 CONVENTION: dict[str, Any] = dict(
@@ -47,7 +50,8 @@ def follower():
 
 def success(team, env):
     """Return the share of steps of one episode in each copy in which the follower did what the leader did."""
-    return evaluate_policy(team, env, n_eval_episodes=50)[0] / 16
+    mean: Any = evaluate_policy(team, env, n_eval_episodes=50)[0]
+    return mean / 16
 
 
 def state(team):
@@ -97,8 +101,13 @@ def test_histories_hold_what_a_training_would_remember(make):
     env = make_team_env(make, n_envs=3, seed=4)
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **kwargs)
     played = []
-    step_async = type(env).step_async
-    env.step_async = lambda actions: (played.append(actions), step_async(env, actions))[1]
+    step_async = env.step_async
+
+    def record(actions):
+        played.append(actions)
+        step_async(actions)
+
+    env.step_async = record
     seed = int(np.random.default_rng(0).integers(2**20))
     env.seed(seed)
     team.learn(120)
@@ -154,17 +163,18 @@ def test_a_single_model_observes_in_an_agent_env():
     kwargs = {"parallel_env": "convention-swap", "agent": "follower", "partners": {}}
     env = make_vec_env(AgentEnv, n_envs=3, seed=0, env_kwargs=kwargs)
     model = BeliefPPO("BeliefPolicy", env, seed=0, **BELIEF).learn(24)
-    before = model.policy.history
+    policy: Any = model.policy
+    before = policy.history
     with observing(model, env) as watched:
         obs = watched.reset()
         infos = watched.step(np.array([0, 1, 2]))[3]
-        history = model.policy.history
+        history = policy.history
         rows = history.observations[history.valid][-3:]
         np.testing.assert_array_equal(rows.argmax(dim=1), obs)
         np.testing.assert_array_equal(history.actions[history.valid][-3:], [info["others_actions"] for info in infos])
         evaluate_policy(model, watched, n_eval_episodes=6)
         assert watched.steps == {"follower": 3 + 2 * 3 * 16}
-    assert all(th.equal(old, new) for old, new in zip(before, model.policy.history, strict=True))
+    assert all(th.equal(old, new) for old, new in zip(before, policy.history, strict=True))
 
 
 def test_a_single_model_observes_as_vec_normalize_shows_it():
@@ -176,7 +186,8 @@ def test_a_single_model_observes_as_vec_normalize_shows_it():
     with observing(model, env) as watched:
         obs = watched.reset()
         watched.step(np.array([0, 1]))
-        history = model.policy.history
+        policy: Any = model.policy
+        history = policy.history
         np.testing.assert_array_equal(history.observations[history.valid][-2:], obs)
 
 

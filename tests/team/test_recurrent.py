@@ -53,7 +53,9 @@ class AtRolloutEnd(BaseCallback):
 
 
 def test_training_sees_the_states_of_the_rollout_and_the_first_ratio_is_one(monkeypatch):
-    ratios, cut, continued = [], [], []
+    ratios: list[th.Tensor] = []
+    cut: list[tuple] = []
+    continued: list[np.ndarray] = []
 
     def check(policy, data):
         with th.no_grad():
@@ -104,7 +106,7 @@ def test_returns_end_with_episodes_and_are_bootstrapped_at_limits():
         np.testing.assert_array_equal(buffer.episode_starts[1:], dones[:-1])
         np.testing.assert_array_equal(buffer.rewards[~dones], rewards[~dones])
         # All copies end together, by truncation: the value of the last observation, with the memory that there is then
-        for t in np.flatnonzero(dones[:-1, 0]):
+        for t in np.flatnonzero(dones[:-1, 0]).tolist():
             last = [info["terminal_observation"]["guest"] for info in infos[t]]
             obs = {key: th.as_tensor(np.stack([row[key] for row in last])) for key in last[0]}
             memory = tuple(th.as_tensor(states[t + 1]) for states in (buffer.hidden_states_vf, buffer.cell_states_vf))
@@ -133,7 +135,8 @@ def test_only_a_memory_over_episodes_knows_the_host():
         env = make_team_env(make, n_envs=16, seed=0, partner_starts=True)
         team = Team(algo, "MultiInputLstmPolicy", env, seed=1, device="cpu", **settings).learn(10 * 256)
         env = make_team_env(make, n_envs=20, seed=1000, partner_starts=True)
-        success[algo.__name__] = evaluate_policy(team, env, n_eval_episodes=160)[0] / 2
+        mean: Any = evaluate_policy(team, env, n_eval_episodes=160)[0]
+        success[algo.__name__] = mean / 2
     assert success["PartnerRecurrentPPO"] > 0.95
     # At the most: all of the first episodes, and a guess in the second ones
     assert success["RecurrentPPO"] < 0.86
