@@ -64,6 +64,10 @@ class RngState:
         if th.cuda.is_initialized():
             self._cuda = th.cuda.get_rng_state_all()
 
+    def generator(self) -> np.random.Generator:
+        """Return numpy's newer interface to the same numbers: what is drawn from it advances this state."""
+        return np.random.Generator(self._numpy)
+
     def get(self) -> dict[str, Any]:
         """Return the state as plain data. It must not be the current one."""
         return {"numpy": self._numpy.state, "torch": self._torch, "python": self.python, "cuda": list(self._cuda)}

@@ -1,12 +1,10 @@
 """Fixed partners of a learner: models, saved files and functions that choose the actions of an agent in a team."""
 
-import inspect
 import os
 import pathlib
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,6 +22,7 @@ from sb3_belief.common.safe_files.archive import names_in
 from sb3_belief.common.safe_files.models import class_of, plain_objects
 from sb3_belief.common.safe_files.trust import PICKLE, UNTRUSTED, Trust
 from sb3_belief.team.checkpoint import as_models_see, read_team
+from sb3_belief.team.fixed_partners.functions import PartnerFunction
 from sb3_belief.team.model_zips import find_algorithm, load_algorithm
 from sb3_belief.team.predictor import PolicyState, Predictor
 
@@ -119,8 +118,7 @@ class Partner:
             _check_spaces(name, given, observation_space, action_space)
             self._predictor = Predictor(given, statistics)
         else:
-            self._function = given
-            self._takes_masks = _takes_masks(given)
+            self._function = PartnerFunction(name, given)
 
     def act(self, obs: Any, episode_start: bool, mask: np.ndarray | None) -> np.ndarray:
         """
@@ -133,16 +131,21 @@ class Partner:
         :raises TypeError: If ``predict`` does not return an action and a state
         """
         if self._predictor is None:
-            kwargs = {"action_masks": mask} if self._takes_masks else {}
-            return np.asarray(self._function(obs, **kwargs))
+            return self._function.one(obs, mask, self.rng.generator())
         start, self._new = np.array([episode_start or self._new]), False
-        result = self._predictor.predict(obs, self._state, start, self._deterministic, mask)
+        action, self._state = self._predict(obs, self._state, start, mask)
+        return action
+
+    def _predict(
+        self, obs: Any, state: PolicyState, starts: np.ndarray, masks: np.ndarray | None
+    ) -> tuple[np.ndarray, PolicyState]:
+        assert self._predictor is not None
+        result = self._predictor.predict(obs, state, starts, self._deterministic, masks)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(
                 f"predict() of the partner {self._name!r} returned {result!r}; as SB3's it must return (action, state)."
             )
-        action, self._state = result
-        return np.asarray(action)
+        return np.asarray(result[0]), result[1]
 
     def reset(self, seed: int | None = None) -> None:
         """
@@ -258,11 +261,3 @@ def _check_spaces(name: str, model: Any, observation_space: spaces.Space, action
                 f"The partner {name!r} has been made for the {kind} space {found}, but {name!r} has {wanted} in this"
                 " environment."
             )
-
-
-def _takes_masks(function: Callable[..., Any]) -> bool:
-    try:
-        return "action_masks" in inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        # Callables written in C need not have a signature
-        return False
