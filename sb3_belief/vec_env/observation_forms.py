@@ -6,7 +6,7 @@ Environments also give tuples, nested dicts, and PettingZoo's ``{"observation": 
 """
 
 import inspect
-from collections.abc import Callable, Iterator, KeysView, Mapping
+from collections.abc import Callable, Iterator, KeysView, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -322,3 +322,37 @@ def parts_of(space: spaces.Space) -> Mapping[Any, spaces.Space]:
     :return: The entries of a ``Dict`` by name; of any other space itself, under None
     """
     return space.spaces if isinstance(space, spaces.Dict) else {None: space}
+
+
+class ObservationStack:
+    """
+    Stacks the observations of all copies.
+
+    :param num_envs: Number of copies
+    :param observation_spaces: Observation space of each agent
+    """
+
+    def __init__(self, num_envs: int, observation_spaces: Mapping[str, spaces.Space]):
+        self._layout = [
+            (agent, [(key, (num_envs, *(part.shape or ())), part.dtype) for key, part in parts_of(space).items()])
+            for agent, space in observation_spaces.items()
+        ]
+
+    def __call__(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """
+        Stack observations.
+
+        :param observations: For each copy, observations by agent
+        :return: ``[num_envs, ...]`` by agent
+        """
+        stacked: dict[str, Any] = {}
+        for agent, parts in self._layout:
+            for key, shape, dtype in parts:
+                rows = [obs[agent] if key is None else obs[agent][key] for obs in observations]
+                # concatenate() takes a third of the time of array()
+                array = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
+                if key is None:
+                    stacked[agent] = array
+                else:
+                    stacked.setdefault(agent, {})[key] = array
+        return stacked

@@ -15,9 +15,10 @@ from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
+from sb3_belief.vec_env.observation_forms import ObservationStack
 from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
 from sb3_belief.vec_env.step_checks import StepChecks
-from sb3_belief.vec_env.team_vec_env import ObservationStack, TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 from sb3_belief.vec_env.validation import check_spaces
 from sb3_belief.vec_env.workers import WorkersVecEnv
 
@@ -98,7 +99,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
         :param seed: The seed, or None
         :return: The copies' seeds
         """
-        return self.venv.seed(seed)
+        self._seeds = list(self.venv.seed(seed))
+        return self._seeds
 
     def set_options(self, options: list[dict] | dict | None = None) -> None:
         """

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.common.plain_data import NotPlainError
 from sb3_belief.vec_env.monitor_files import monitor_sizes, open_monitor_files
-from sb3_belief.vec_env.observation_forms import parts_of
 from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
@@ -237,6 +236,9 @@ class TeamVecEnv(VecEnv):
         # evaluate_policy asks whether there is a Monitor before it trusts info["episode"]; the monitoring here does the same
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
+    def begin_rollout(self) -> None:
+        """Be told that the team which learns here begins a rollout; what changes with rollouts overrides it."""
+
     # Monitoring
 
     def start_monitor(self, folder: str, continue_from: Mapping[str, Any] | None = None) -> None:
@@ -364,37 +366,3 @@ class TeamVecEnv(VecEnv):
                     f" got {checked[agent].shape}."
                 )
         return checked
-
-
-class ObservationStack:
-    """
-    Stacks the observations of all copies.
-
-    :param num_envs: Number of copies
-    :param observation_spaces: Observation space of each agent
-    """
-
-    def __init__(self, num_envs: int, observation_spaces: Mapping[str, spaces.Space]):
-        self._layout = [
-            (agent, [(key, (num_envs, *(part.shape or ())), part.dtype) for key, part in parts_of(space).items()])
-            for agent, space in observation_spaces.items()
-        ]
-
-    def __call__(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """
-        Stack observations.
-
-        :param observations: For each copy, observations by agent
-        :return: ``[num_envs, ...]`` by agent
-        """
-        stacked: dict[str, Any] = {}
-        for agent, parts in self._layout:
-            for key, shape, dtype in parts:
-                rows = [obs[agent] if key is None else obs[agent][key] for obs in observations]
-                # concatenate() takes a third of the time of array()
-                array = np.concatenate(rows, axis=None, dtype=dtype, casting="unsafe").reshape(shape)
-                if key is None:
-                    stacked[agent] = array
-                else:
-                    stacked.setdefault(agent, {})[key] = array
-        return stacked

@@ -26,8 +26,8 @@ from sb3_belief.common.processes import (
 )
 from sb3_belief.common.sent_errors import SentError, rebuilt_error
 from sb3_belief.vec_env.joint_env import JointEnv
+from sb3_belief.vec_env.observation_forms import ObservationStack
 from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
-from sb3_belief.vec_env.team_vec_env import ObservationStack
 from sb3_belief.vec_env.validation import place
 from sb3_belief.vec_env.worker_line import WorkerLine, close_lines
 from sb3_belief.vec_env.worker_loop import FAILED, STEP

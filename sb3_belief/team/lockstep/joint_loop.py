@@ -278,7 +278,7 @@ class JointLoop(Scheduler):
         rngs.to(rng)
         if self.at_first_rollout is not None:
             self.at_first_rollout()
-        progress.on_rollout_start()
+        self._start_rollout(progress)
         self._begin_rollouts(rngs)
         while learning:
             self._batch_forwards(rngs)
@@ -352,8 +352,13 @@ class JointLoop(Scheduler):
         learning = self._learning()
         progress.on_round_end(learning)
         if team_ended and learning:
-            progress.on_rollout_start()
+            self._start_rollout(progress)
         self._begin_rollouts(rngs)
+
+    def _start_rollout(self, progress: TeamProgress) -> None:
+        progress.on_rollout_start()
+        # After the callback, which may save the team: what is saved then begins this rollout when it goes on
+        self.team_env.begin_rollout()
 
     def _begin_rollouts(self, rngs: RngSwitch) -> None:
         """Let the agents that are to begin a rollout choose their first actions."""
