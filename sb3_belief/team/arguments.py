@@ -1,7 +1,7 @@
 """Checks and conversions of what a user gives a ``Team``."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from numbers import Real
 from typing import Any
 
@@ -104,6 +104,23 @@ def check_agent_keys(name: str, given: Mapping[str, Any], agents: Sequence[str])
         raise ValueError(f"{name} has entries for unknown agents {unknown}; the agents are {list(agents)}.")
 
 
+def partners_hint(scripted: Collection[str], env_agents: Collection[str]) -> str:
+    """
+    Return what to say where an environment has agents to act for that a team has learned beside.
+
+    :param scripted: Names of the team's scripted others
+    :param env_agents: Names of the environment's agents
+    :return: A sentence, or nothing
+    """
+    missing = [name for name in scripted if name in env_agents]
+    if not missing:
+        return ""
+    return (
+        f" Partners acted for {missing} when the team learned: give them, PartnersVecEnv(env, partners) or Team.load(path,"
+        " env=env, partners=partners)."
+    )
+
+
 def check_same_agents(
     agents: list[str], scripted: dict[str, str], env_agents: list[str], env_scripted: dict[str, str]
 ) -> None:
@@ -117,7 +134,8 @@ def check_same_agents(
     :raises ValueError: If they differ
     """
     if env_agents != agents:
-        raise ValueError(f"The team has the agents {agents}, the environment {env_agents}.")
+        hint = partners_hint(scripted, env_agents)
+        raise ValueError(f"The team has the agents {agents}, the environment {env_agents}.{hint}")
     if list(env_scripted.items()) != list(scripted.items()):
         raise ValueError(f"The team has learned with the scripted others {scripted}, the environment has {env_scripted}.")
 

@@ -34,6 +34,7 @@ from sb3_belief.common.safe_files.archive import SUMS, from_json, names_in, read
 from sb3_belief.common.safe_files.models import add_plain_data, check_parameters
 from sb3_belief.common.safe_files.trust import PICKLE, UNTRUSTED, Trust
 from sb3_belief.common.versions import versions
+from sb3_belief.team.arguments import partners_hint
 from sb3_belief.team.finite import check_finite
 from sb3_belief.team.model_zips import find_algorithm, load_algorithm
 from sb3_belief.team.normalization import AgentNormalize
@@ -149,7 +150,10 @@ class SavedTeam:
         """
         saved_agents = list(self.manifest["agents"])
         if saved_agents != agents:
-            raise ValueError(f"The saved team has the agents {saved_agents}, the environment has {agents} (in this order).")
+            hint = partners_hint(self.scripted, agents)
+            raise ValueError(
+                f"The saved team has the agents {saved_agents}, the environment has {agents} (in this order).{hint}"
+            )
         differences = []
         for agent in agents:
             for name, here in (("observation", env.observation_space), ("action", env.action_space)):

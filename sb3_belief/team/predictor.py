@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_belief.team.arguments import check_agent_keys
+from sb3_belief.team.arguments import check_agent_keys, partners_hint
 from sb3_belief.vec_env.team_vec_env import JointObs, TeamObs
 
 # Recurrent state of a policy, as SB3's predict() takes and returns it
@@ -95,10 +95,16 @@ class TeamPredictor:
 
     :param models: The models by agent
     :param statistics: The normalisation of the agents that have one
+    :param scripted: Names of the scripted others, who act in the environment by themselves
     """
 
-    def __init__(self, models: Mapping[str, BaseAlgorithm], statistics: Mapping[str, VecNormalize]):
-        self._models, self._statistics = models, statistics
+    def __init__(
+        self,
+        models: Mapping[str, BaseAlgorithm],
+        statistics: Mapping[str, VecNormalize],
+        scripted: Collection[str] = (),
+    ):
+        self._models, self._statistics, self._scripted = models, statistics, scripted
         self._has_warned = self._has_warned_of_lives = False
 
     @property
@@ -131,7 +137,10 @@ class TeamPredictor:
                 f"A team predicts from {{agent: observation}}, not from {type(observation).__name__}; a single agent's model,"
                 " team.agents[name], predicts from its own observation."
             )
-        check_agent_keys("The observation", observation, list(self._models))
+        try:
+            check_agent_keys("The observation", observation, list(self._models))
+        except ValueError as error:
+            raise ValueError(f"{error}{partners_hint(self._scripted, observation)}") from None
         if action_masks is None and not self._has_warned and self.takes_masks:
             self._has_warned = True
             warnings.warn(

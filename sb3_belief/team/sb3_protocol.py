@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_belief.team.arguments import check_agent_keys, check_same_agents, check_team_vec_env, check_total_timesteps
 from sb3_belief.team.checkpoint import read_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop
-from sb3_belief.team.logs import record_statistics, record_time
+from sb3_belief.team.logs import TeamLog, record_statistics, record_time
 
 # Arguments of algorithms that a team has itself
 _OWN = {"policy", "env", "seed", "verbose", "tensorboard_log"}
@@ -56,13 +56,18 @@ class SB3Protocol:
     ``team.learning_rate``, where all agents have the same value.
     """
 
-    # What a team sets: ``AgentModels``, its loop, its counters and its scripted others' action spaces
+    # What a team sets: ``AgentModels``, its loop, logs, counters and scripted others' action spaces
     _agents: Any
     _loop: JointLoop | None
+    _exact: Any
+    _log: TeamLog | None
+    _log_dir: str | None
     _logger: Logger | None
     _learning: bool
     _scripted: dict[str, str]
     possible_agents: list[str]
+    tensorboard_log: str | None
+    verbose: int
     ep_info_buffer: deque[dict[str, Any]]
     ep_success_buffer: deque[bool]
     num_timesteps: int
@@ -125,6 +130,27 @@ class SB3Protocol:
         record_statistics(self.logger, self.ep_info_buffer, self.ep_success_buffer, self.get_env())
         record_time(self.logger, self._iterations, self.num_timesteps, self._start_timesteps, self._start_time)
         self.logger.dump(step=self.num_timesteps)
+
+    def _make_log(self, run_name: str | None) -> TeamLog:
+        if self._log is None:
+            self._log = TeamLog(
+                self.possible_agents,
+                self.verbose,
+                self._log_dir,
+                self.tensorboard_log,
+                run_name or "Team",
+                continue_from=self._exact.log_state,
+            )
+            for agent, model in self.agents.items():
+                self._log.connect(agent, model)
+            if self._logger is None:
+                self._logger = self._log.team_logger
+        elif run_name not in (None, self._log.run_name):
+            raise ValueError(
+                f"tb_log_name is {run_name!r}, but this team's run is {self._log.run_name!r} since its first learn():"
+                " leave it out, or load the team anew (Team.load) for a run of another name."
+            )
+        return self._log
 
     @property
     def observation_space(self) -> spaces.Dict:

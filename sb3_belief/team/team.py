@@ -29,6 +29,7 @@ from sb3_belief.team.lockstep.joint_loop import JointLoop, TeamProgress
 from sb3_belief.team.logs import TeamLog
 from sb3_belief.team.masks import MaskCheck
 from sb3_belief.team.parallel import ParallelLearning, check_jobs
+from sb3_belief.team.partners.vec_env import Partners, with_partners
 from sb3_belief.team.predictor import PolicyState, TeamPredictor
 from sb3_belief.team.sb3_protocol import SB3Protocol
 from sb3_belief.vec_env.team_vec_env import TeamObs
@@ -70,6 +71,8 @@ class Team(SB3Protocol):
         ``torch.set_num_threads(1)`` each process takes one core
     :param on_nan: What is done when an update makes loss or parameters of an agent non-finite: ``"raise"`` puts back the last
         finite ones and stops with a ``NonFiniteError``, ``"skip"`` takes the update back, warns and goes on
+    :param partners: Partners (see ``PartnersVecEnv``) or pools of them (``PartnerPool``) by agent. These agents act and do not
+        learn, all others are the team. They are not saved with it
     :param agent_kwargs: Arguments of single agents' algorithms by agent, which override ``kwargs``
     :param kwargs: Further arguments of the algorithm class for all agents
     :raises TypeError: If ``env`` is no ``TeamVecEnv`` or a class no SB3 algorithm
@@ -91,11 +94,13 @@ class Team(SB3Protocol):
         agent_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         jobs: int = 1,
         on_nan: str = "raise",
+        partners: Partners | None = None,
         **kwargs: Any,
     ):
         check_jobs(jobs)
         check_on_nan(on_nan)
-        loop = JointLoop(check_team_vec_env(env))
+        env = with_partners(check_team_vec_env(env), partners)
+        loop = JointLoop(env)
         names = loop.possible_agents
         classes, policies = per_agent("algo_class", algo_class, names), per_agent("policy", policy, names)
         own_kwargs = agent_kwargs or {}
@@ -121,7 +126,7 @@ class Team(SB3Protocol):
     ) -> None:
         self._loop = loop
         self._agents = agents
-        self._predictor = TeamPredictor(agents.models, agents.statistics)
+        self._predictor = TeamPredictor(agents.models, agents.statistics, scripted)
         self._scripted = scripted
         self.possible_agents = list(agents.models)
         self.seed = seed
@@ -319,6 +324,7 @@ class Team(SB3Protocol):
         exact: bool = False,
         trust_pickle: bool = False,
         allow_packages: Iterable[str] = (),
+        partners: Partners | None = None,
         **kwargs: Any,
     ) -> SelfTeam:
         """
@@ -340,6 +346,7 @@ class Team(SB3Protocol):
             order. Its ``total_timesteps`` are the remaining ones, and ``env`` is made by the same arguments
         :param trust_pickle: Whether to read pickles (older files, functions), which can run any code of whoever made the file
         :param allow_packages: Packages of your own of which the file may name classes and functions
+        :param partners: As in the constructor; ``trust_pickle`` and ``allow_packages`` hold for their files, too
         :param kwargs: Arguments of the algorithms that replace the saved ones (``learning_rate=1e-5``), and ``seed``, which
             replaces that of the team
         :return: The team
@@ -351,8 +358,10 @@ class Team(SB3Protocol):
         check_on_nan(on_nan)
         if exact:
             check_exact_load(env, {**kwargs, **(agent_kwargs or {})})
-        saved = read_team(path, Trust.of(trust_pickle, allow_packages))
-        loop = None if env is None else JointLoop(check_team_vec_env(env))
+        trust = Trust.of(trust_pickle, allow_packages)
+        saved = read_team(path, trust)
+        env = None if env is None else with_partners(check_team_vec_env(env), partners, trust)
+        loop = None if env is None else JointLoop(env)
         if loop is not None:
             saved.check_env(loop.env, loop.possible_agents, loop.scripted)
         manifest = saved.manifest
@@ -377,24 +386,3 @@ class Team(SB3Protocol):
     def monitor_state(self) -> dict[str, Any] | None:
         """How far the monitor files were when the team was saved, for ``start_monitor``; until the team learns."""
         return self._exact.monitor_state
-
-    def _make_log(self, run_name: str | None) -> TeamLog:
-        if self._log is None:
-            self._log = TeamLog(
-                self.possible_agents,
-                self.verbose,
-                self._log_dir,
-                self.tensorboard_log,
-                run_name or "Team",
-                continue_from=self._exact.log_state,
-            )
-            for agent, model in self.agents.items():
-                self._log.connect(agent, model)
-            if self._logger is None:
-                self._logger = self._log.team_logger
-        elif run_name not in (None, self._log.run_name):
-            raise ValueError(
-                f"tb_log_name is {run_name!r}, but this team's run is {self._log.run_name!r} since its first learn():"
-                " leave it out, or load the team anew (Team.load) for a run of another name."
-            )
-        return self._log
