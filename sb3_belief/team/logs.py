@@ -17,6 +17,9 @@ from sb3_belief.common.file_names import file_name
 from sb3_belief.team.finite import SKIPPED
 from sb3_belief.team.log_files import counters, open_logger, put_counters_back, sync_logger, table_state
 
+# Beside how many partners, the last that were met, the mean returns are logged
+_MOST_PARTNERS = 20
+
 
 def _has_spread(key: str) -> bool:
     """
@@ -261,19 +264,27 @@ class TeamLog:
 
 
 def record_statistics(
-    logger: Logger, episodes: Collection[dict[str, Any]], successes: Collection[bool], env: VecEnv | None = None
+    logger: Logger, episodes: Sequence[dict[str, Any]], successes: Collection[bool], env: VecEnv | None = None
 ) -> None:
     """
-    Record the means over the last episodes, and how often copies of the environment have been made anew, if any have.
+    Record the means over the last episodes, of all and beside each partner, and how often copies of the environment have been
+    made anew, if any have.
 
     :param logger: Logger of the team
-    :param episodes: What ``info["episode"]`` said of them
+    :param episodes: What ``info["episode"]`` said of them, and beside which ``partner`` they ended, if the environment says so
     :param successes: Whether they were successes, as far as the environment says so
     :param env: The team's environment
     """
     if episodes:
         logger.record("rollout/ep_rew_mean", safe_mean([episode["r"] for episode in episodes]))
         logger.record("rollout/ep_len_mean", safe_mean([episode["l"] for episode in episodes]))
+    returns: dict[str, list[float]] = {}
+    for episode in reversed(episodes):
+        # The last ones met, since a pool may have any number of partners
+        if "partner" in episode and (episode["partner"] in returns or len(returns) < _MOST_PARTNERS):
+            returns.setdefault(episode["partner"], []).append(episode["r"])
+    for name in sorted(returns):
+        logger.record(f"partners/{name}/ep_rew_mean", safe_mean(returns[name]))
     if successes:
         logger.record("rollout/success_rate", safe_mean(list(successes)))
     if env is not None and (restarts := getattr(env.unwrapped, "n_restarts", 0)):

@@ -108,7 +108,9 @@ class TeamProgress:
         if dones.any():
             for info in infos:
                 if "episode" in info:
-                    self._team.ep_info_buffer.append(info["episode"])
+                    # Who the partner was is for the log, and never in what the agents are given of the episode
+                    met = {"partner": info["partner"]} if isinstance(info.get("partner"), str) else {}
+                    self._team.ep_info_buffer.append({**info["episode"], **met})
                     if "is_success" in info:
                         self._team.ep_success_buffer.append(info["is_success"])
         return continues

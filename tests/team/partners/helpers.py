@@ -27,8 +27,8 @@ def partnered(partners, n_agents=2, n_envs=2, seed=0, **kwargs: Any) -> Partners
 
 
 def pool_of(n_members=2, **kwargs: Any) -> PartnerPool:
-    """Return a pool of partners that do the action which is their name."""
-    return PartnerPool({str(k): (lambda obs, k=k: k) for k in range(n_members)}, **kwargs)
+    """Return a pool of partners that do the action which is their name, modulo 3."""
+    return PartnerPool({str(k): (lambda obs, k=k: k % 3) for k in range(n_members)}, **kwargs)
 
 
 def saved_team(path, algo, policy="MlpPolicy", seed=0, n_agents=2, **kwargs):
