@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import frame_rate, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common, add_saved_team
+from sb3_belief.cli.flags import add_common, add_partners, add_saved_team
 
 HELP = "replay a trained team"
 
@@ -15,6 +15,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     :param parser: Parser of the command
     """
     add_saved_team(parser)
+    add_partners(parser, "those of its run")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--episodes", type=positive_number, default=1, help="number of episodes to play")
     length.add_argument("-n", "--n-timesteps", type=positive_number, help="number of steps to play instead")
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
-    names = "run env trust episodes n_timesteps deterministic seed output fps device observe"
+    names = "run env partners trust episodes n_timesteps deterministic seed output fps device observe"
     enjoy(
         EnjoyOptions(
             **{name: getattr(args, name) for name in names.split()},

@@ -74,6 +74,22 @@ def add_saved_team(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_partners(parser: argparse.ArgumentParser, otherwise: str) -> None:
+    """
+    Add the flag that names partners.
+
+    :param parser: Parser of the command
+    :param otherwise: Who the partners are without it
+    """
+    parser.add_argument(
+        "--partners",
+        type=filled_text,
+        metavar="FILE.yml|RUN",
+        help="who acts for the agents that do not learn: a YAML file (learners, members, runs, ...), the folder of a run or a"
+        f" zip; if left out, {otherwise}",
+    )
+
+
 def add_common(parser: argparse.ArgumentParser) -> None:
     """
     Add the flags of all commands that load a team and make its environment.

@@ -15,7 +15,7 @@ from sb3_belief.cli.flag_types import (
     thread_number,
     whole_number,
 )
-from sb3_belief.cli.flags import ALGO, ENV, LIST, PAIRS, Parser, add_common
+from sb3_belief.cli.flags import ALGO, ENV, LIST, PAIRS, Parser, add_common, add_partners
 from sb3_belief.zoo.errors import ConfigError
 
 HELP = "train a team from a YAML configuration"
@@ -65,6 +65,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--eval-env-kwargs", **LIST, metavar="K:V", help="arguments of the environment in evaluations, beside --env-kwargs"
     )
     parser.add_argument("-params", **LIST, metavar="K:V", help=f"settings: {PAIRS}")
+    add_partners(parser, "those of its 'partners' setting; beside the learners that it names")
     parser.add_argument("-conf", "--conf-file", type=filled_text, help="YAML file instead of zoo_configs/<algo>.yml")
     parser.add_argument(
         "--vec-env",
@@ -154,6 +155,7 @@ def run(args: argparse.Namespace, command: list[str]) -> int:
             f" for seed in {seeds}; do sb3-belief train --seed $seed ...; done"
         )
     from sb3_belief.zoo.config import load_config
+    from sb3_belief.zoo.partners import partners_of_flag
     from sb3_belief.zoo.resume import resume_config
     from sb3_belief.zoo.train import TrainOptions, train
 
@@ -164,6 +166,7 @@ def run(args: argparse.Namespace, command: list[str]) -> int:
         "eval_env_kwargs": args.eval_env_kwargs,
         "n_timesteps": args.n_timesteps,
         "extra_packages": tuple(args.allow_package),
+        "overrides": [] if args.partners is None else [("--partners", {"partners": partners_of_flag(args.partners)})],
     }
     if args.trained_agent is None:
         config = load_config(args.algo or ALGO, args.env or ENV, **settings)

@@ -62,7 +62,7 @@ def episode_rows(
         checkpoints.append(("best", BEST_MODEL, best_steps))
     options = cell["options"]
     settings = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
-    with closing(make_env(settings, options["n_eval_envs"], final_seed(cell["seed"]))) as env:
+    with closing(make_env(settings, options["n_eval_envs"], final_seed(cell["seed"]), evaluation=True)) as env:
         for checkpoint, file, steps in checkpoints:
             team = _load(run / file, env, options["device"], extra_packages)
             for deterministic in (True, False):

@@ -22,6 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import get_algo, get_env, load_env
+from sb3_belief.zoo.partners import PartnersConfig, partners_config
 from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker, observation_arguments
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
@@ -71,6 +72,7 @@ class RunConfig:
     :param algo_kwargs: Constructor arguments of each agent's algorithm
     :param eval_env_kwargs: Arguments of the environment of evaluations, which override ``env_kwargs``
     :param agents: The agents with settings of their own
+    :param partners: The agents that act and do not learn; None if all learn
     :param origins: Where each setting comes from: the file and its section, or the flag
     """
 
@@ -91,6 +93,7 @@ class RunConfig:
     algo_kwargs: dict[str, Any] = field(default_factory=dict)
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
     agents: dict[str, AgentConfig] = field(default_factory=dict)
+    partners: PartnersConfig | None = None
     origins: dict[str, str] = field(default_factory=dict)
 
     def origin(self, message: str = "") -> str:
@@ -217,6 +220,11 @@ def load_config(
     for key in ("policy", "n_timesteps"):
         if key not in checked:
             raise ConfigError(f"{path}: no {key!r} for {env_id!r}: add it to the section {env_id!r} or {DEFAULT!r}.")
+    if checked.get("partners") is not None:
+        # As plain data with all paths, so that config.yml does not depend on the working folder nor on what runs there are
+        settings["partners"] = checked["partners"]
+        location = Location(f"{origins['partners']}: partners", extra_packages)
+        checked["partners"] = partners_config(checked["partners"], location)
     config = _to_run_config(algo, env_id, settings, str(path), checker.algo_class, {**checked, **chosen.fixed}, origins)
     _check_episodic(config)
     return config
@@ -296,7 +304,11 @@ def _check_episodic(config: RunConfig) -> None:
 
 
 def _override(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    return merge({key: value for key, value in base.items() if not (key in _REPLACED and key in over)}, over)
+    merged = merge({key: value for key, value in base.items() if not (key in _REPLACED and key in over)}, over)
+    if isinstance(over.get("partners"), dict):
+        # Other members take the place of those of a lower layer, and do not join them
+        merged["partners"] = {**(base.get("partners") or {}), **over["partners"]}
+    return merged
 
 
 def _wrap(env: Any, wrappers: Sequence[tuple[Callable[..., Any], dict[str, Any]]]) -> Any:
@@ -341,6 +353,7 @@ def _to_run_config(
             )
             for agent, own in checked.get("agent_kwargs", {}).items()
         },
+        partners=checked.get("partners"),
         origins=origins,
     )
 

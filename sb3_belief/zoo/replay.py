@@ -11,10 +11,12 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
+from sb3_belief.team.checkpoint import read_team
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_call
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.names import get_env, load_env
+from sb3_belief.zoo.partners import PartnersConfig, check_partners, partners_config, partners_of_flag
 from sb3_belief.zoo.run_folder import CONFIG, RECORD, check_record, run_of
 from sb3_belief.zoo.yaml_data import parse_pairs
 
@@ -30,6 +32,8 @@ class ShownTeam:
     :param extra_packages: See ``names.resolve`` and ``Team.load`` (``allow_packages``)
     :param trust: Whether to load the team, and what its run's folder names, even if that could run any code
     :param device: Device of all models: ``"auto"``, ``"cpu"``, ``"cuda"``, ...
+    :param partners: Folder of a run, zip or YAML file of the partners beside whom the team plays (see ``partners_of_flag``);
+        None for those of its run
     """
 
     run: str
@@ -38,6 +42,7 @@ class ShownTeam:
     extra_packages: tuple[str, ...] = ()
     trust: bool = False
     device: str = "auto"
+    partners: str | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class ShownEnvironment:
     :param wrapper: Argument of ``make_team_env``
     :param frame_rate: Frames per second
     :param observation: Further arguments of it: what agents observe besides
+    :param partners: The agents that are not of the team; None if all are
     """
 
     env_id: str
@@ -57,6 +63,7 @@ class ShownEnvironment:
     wrapper: Callable[[Any], Any] | None
     frame_rate: int = 10
     observation: dict[str, Any] = field(default_factory=dict)
+    partners: PartnersConfig | None = None
 
 
 def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironment:
@@ -73,9 +80,8 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     if saved.env is not None:
         make_env = load_env(saved.env, "--env", packages)
         given, n_leading = parse_pairs(saved.env_kwargs, "--env-kwargs"), len(get_env(saved.env, "--env").leading)
-        return ShownEnvironment(
-            saved.env, check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading, of_env=True), None
-        )
+        kwargs = check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading, of_env=True)
+        return ShownEnvironment(saved.env, kwargs, None, partners=_given_partners(path, saved))
     run = run_of(path)
     if run is None:
         raise ConfigError(
@@ -86,7 +92,21 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     check_record(run, packages, trust=saved.trust)
     folder = None if saved.trust else conf_file.parent
     config = load_config(algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder)
-    return ShownEnvironment(config.env_id, config.env_kwargs, config.wrapper, observation=config.observation)
+    partners = config.partners if saved.partners is None else _given_partners(path, saved)
+    return ShownEnvironment(
+        config.env_id, config.env_kwargs, config.wrapper, observation=config.observation, partners=partners
+    )
+
+
+def _given_partners(path: Path, saved: ShownTeam) -> PartnersConfig | None:
+    """Return the partners that a flag names, beside the agents of the saved team."""
+    if saved.partners is None:
+        return None
+    # The agents of the team are those that have learned, whatever a file says
+    learners = {"learners": list(read_team(path, Trust.of(saved.trust, saved.extra_packages)).models)}
+    location = Location("--partners", saved.extra_packages)
+    given = check_partners(partners_of_flag(saved.partners), location)
+    return partners_config({**(given or {}), **learners}, location)
 
 
 def render_modes_of(shown: ShownEnvironment, command: str) -> tuple[ShownEnvironment, list[str]]:
@@ -137,6 +157,8 @@ def team_in_its_environment(
     """
     with _refusals_as_config_errors(shown, command):
         env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper, **shown.observation)
+        if shown.partners is not None:
+            env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
     try:
         try:
             trust = Trust.of(saved.trust, saved.extra_packages)

@@ -23,15 +23,15 @@ from sb3_belief.team.checkpoints import checkpoint_files
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short
 from sb3_belief.zoo.names import get_algo, load_env
+from sb3_belief.zoo.run_files import BEST_MODEL as BEST_MODEL
+from sb3_belief.zoo.run_files import CHECKPOINTS as CHECKPOINTS
+from sb3_belief.zoo.run_files import TEAM as TEAM
 
 CONFIG = "config.yml"
 RECORD = "run.json"
-TEAM = "team.zip"
-BEST_MODEL = "best_model.zip"
 EVALUATIONS = "evaluations.npz"
 #: The belief viewer, once it has been written
 VIEWER = "viewer.html"
-CHECKPOINTS = "checkpoints"
 # How a run ended that can be continued, by its record
 UNFINISHED = ("running", "interrupted", "failed")
 # Flag of a run that continues training a saved team

@@ -16,6 +16,7 @@ from sb3_belief.zoo.checks import Location, accepted_arguments, check_call, chec
 from sb3_belief.zoo.errors import ConfigError, unknown_setting
 from sb3_belief.zoo.limits import check_limits
 from sb3_belief.zoo.names import Algo, resolve
+from sb3_belief.zoo.partners import check_partners
 
 #: The settings of the run itself. Every other key is an argument of the algorithm's constructor
 RUN_KEYS: dict[str, Any] = {
@@ -32,6 +33,7 @@ RUN_KEYS: dict[str, Any] = {
     "eval_env_kwargs": dict[str, Any],
     "callback": str | list[Any] | dict[str, Any] | None,
     "agent_kwargs": dict[str, dict[str, Any]],
+    "partners": dict[str, Any] | None,
 }
 # The settings that agent_kwargs may give a single agent, besides the arguments of its algorithm
 _AGENT_KEYS = {"algo": str, "policy": str, "policy_kwargs": dict[str, Any]}
@@ -124,6 +126,8 @@ class SettingsChecker:
         value = check_value(value, RUN_KEYS[key], location)
         if key in ("n_envs", "n_timesteps", "policy_kwargs", "normalize"):
             check_limits({key: value}, location.parent)
+        if key == "partners":
+            return check_partners(value, location)
         if key == "agent_kwargs":
             return {agent: self.agents[agent]._check_agent(own, location.key(agent)) for agent, own in value.items()}
         if key == "memory_span" and value not in MEMORY_SPANS:

@@ -127,18 +127,28 @@ def make_envs(config: RunConfig, options: TrainOptions, stack: ExitStack) -> tup
     seed = options.seed
     assert seed is not None
     limit = options.step_timeout if options.step_timeout > 0 else None
-    env = make_env(config, config.n_envs, seed, options.vec_env, step_timeout=limit, restart_workers=options.restart_workers)
+    env = make_env(
+        config,
+        config.n_envs,
+        seed,
+        options.vec_env,
+        trust_pickle=options.trust,
+        step_timeout=limit,
+        restart_workers=options.restart_workers,
+    )
     stack.callback(env.close)
     config.check_agents(env.possible_agents)
     check_memory(config, env)
     _check_first_reset(config, env)
     if config.wrapper is not None:
-        with closing(make_env(config, 1, seed)) as tried:
+        with closing(make_env(config, 1, seed, trust_pickle=options.trust)) as tried:
             check_step(config, tried)
     eval_env = None
     if options.eval_freq > 0:
         eval_config = replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs})
-        eval_env = make_env(eval_config, options.n_eval_envs, env_seed(seed, purpose=1), "dummy")
+        eval_env = make_env(
+            eval_config, options.n_eval_envs, env_seed(seed, purpose=1), evaluation=True, trust_pickle=options.trust
+        )
         stack.callback(eval_env.close)
         check_eval_env(config, env, eval_env)
     return env, eval_env
@@ -179,20 +189,30 @@ def _check_options(config: RunConfig, options: TrainOptions) -> None:
         check_copies(options.n_eval_envs, "dummy", "--n-eval-envs")
 
 
-def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy", **faults: Any) -> TeamVecEnv:
+def make_env(
+    config: RunConfig,
+    n_envs: int,
+    seed: int,
+    vec_env: str = "dummy",
+    evaluation: bool = False,
+    trust_pickle: bool = False,
+    **faults: Any,
+) -> TeamVecEnv:
     """
-    Make the environment that a configuration describes.
+    Make the environment that a configuration describes, with the partners that act in it.
 
     :param config: The configuration
     :param n_envs: Number of environment copies
     :param seed: Copy i is seeded with ``seed + i``
     :param vec_env: ``"dummy"`` or ``"subproc"``
+    :param evaluation: Whether it is an environment of evaluations, in which partners are met that are held out
+    :param trust_pickle: Whether to unpickle what the files of partners hold
     :param faults: ``step_timeout`` and ``restart_workers``, as for ``make_team_env``
     :return: The environment of the team
-    :raises ConfigError: If the environment refuses its settings
+    :raises ConfigError: If the environment refuses its settings, or partners do not fit
     """
     try:
-        return make_team_env(
+        env = make_team_env(
             config.env_id,
             n_envs=n_envs,
             seed=seed,
@@ -207,6 +227,26 @@ def make_env(config: RunConfig, n_envs: int, seed: int, vec_env: str = "dummy", 
     except Exception as error:
         reason = cause(error)
         raise ConfigError(f"{config.origin(reason)}: {config.env_id} refuses its settings: {reason}") from error
+    return env if config.partners is None else with_config_partners(config, env, evaluation, trust_pickle)
+
+
+def with_config_partners(config: RunConfig, env: TeamVecEnv, evaluation: bool, trust_pickle: bool) -> TeamVecEnv:
+    """
+    Put the partners of a configuration into an environment, which is closed if they do not fit.
+
+    :param config: The configuration, with partners
+    :param env: The environment
+    :param evaluation: As for ``make_env``
+    :param trust_pickle: As for ``make_env``
+    :return: The environment of the learners
+    :raises ConfigError: If the partners do not fit
+    """
+    assert config.partners is not None
+    try:
+        return config.partners.put_into(env, evaluation, trust_pickle)
+    except Exception as error:
+        env.close()
+        raise ConfigError(f"{config.origins['partners']}: partners: {cause(error)}") from error
 
 
 def make_team(
