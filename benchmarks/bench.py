@@ -18,6 +18,8 @@ Parts:
 - ``workers``: an environment whose step takes 10 ms, in worker processes (benchmarks/heavy.py)
 - ``finite``: updates with the search for what is not finite, against updates alone (benchmarks/finite.py)
 - ``checkpoints``: learning with the checkpoints that a run has by default, against without (benchmarks/checkpoints.py)
+- ``partners``: one learner among nine partners: a pool of saved teams against one, and functions of batches against the
+  callables of an ``AgentEnv`` (benchmarks/partners.py)
 - ``gpu``: updates on a GPU against the CPU, where there is a GPU
 
 torch uses one thread. Speeds are joint steps (of one copy) per second of CPU time, including that of workers, and per second
@@ -31,7 +33,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory
+from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory, partners
 from benchmarks.measure import Loop, Sample, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
@@ -110,6 +112,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "workers": heavy.run,
     "finite": finite.run,
     "checkpoints": checkpoints.run,
+    "partners": partners.run,
     "gpu": gpu.run,
 }
 

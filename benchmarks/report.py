@@ -29,6 +29,9 @@ BARS: dict[str, tuple[str, float]] = {
     "checks_ppo": ("<=", 1.02),
     "checkpoints_vs_none": (">=", 0.97),
     "seconds_of_a_checkpoint": ("<", 0.5),
+    "pool_vs_one_team": (">=", 0.5),
+    "pool_per_copy_vs_one_team": (">=", 0.5),
+    "partners_vs_agent_env": (">=", 10.0),
 }
 #: The same of peak memory, in MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}

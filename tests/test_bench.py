@@ -19,7 +19,9 @@ AGENT_STEPS = 32
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
     out = tmp_path_factory.mktemp("bench") / "out" / "bench.json"
-    bench.main(["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "--out", str(out)])
+    bench.main(
+        ["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "partners", "--out", str(out)]
+    )
     return json.loads(Path(out).read_text())
 
 

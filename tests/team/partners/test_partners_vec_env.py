@@ -1,6 +1,6 @@
 """Partners in a team: they act as in an ``AgentEnv``, for all copies at once, and the learners get the same."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ def test_recurrent_and_masked_partners_act_as_in_an_agent_env(tmp_path):
 
     # MaskedEnv raises if an action is masked out
     for partner in (str(tmp_path / "masked.zip"), allowed, lambda obs, action_masks: int(action_masks.argmax())):
-        masked_env = PartnersVecEnv(make_team_env(masked, n_envs=2), {"agent_1": partner})
+        masked_env: Any = PartnersVecEnv(make_team_env(masked, n_envs=2), {"agent_1": partner})
         masked_env.reset()
         for t in range(20):
             assert masked_env.action_masks()["agent_0"].argmax(axis=1).tolist() == [t % 7 % 3] * 2
@@ -193,7 +193,7 @@ def test_a_team_learns_saves_and_loads_beside_partners(tmp_path):
     with pytest.raises(ValueError, match=r"Partners acted for \['agent_1'\].*PartnersVecEnv\(env, partners\)"):
         evaluate_policy(team, env, n_eval_episodes=1)
     eval_env = PartnersVecEnv(env, partners)
-    returns, lengths = evaluate_policy(team, VecMonitor(eval_env), 4, return_episode_rewards=True)
+    returns, lengths = cast(Any, evaluate_policy(team, VecMonitor(eval_env), 4, return_episode_rewards=True))
     assert len(returns) == 4 and lengths == [7] * 4
 
 

@@ -100,9 +100,17 @@ def test_each_present_member_makes_one_pass_and_keeps_its_memory(tmp_path):
     pool = PartnerPool(paths, seed=3)
     env = partnered({"agent_1": pool}, n_envs=6, seed=20, deterministic=True)
     calls: list[int] = []
-    for member in env._seats[0][0]._members:
-        predict = member._predictor.predict
-        member._predictor.predict = lambda obs, *args, _own=predict: (calls.append(len(obs)), _own(obs, *args))[1]
+
+    def counted(predict):
+        def call(obs, *args):
+            calls.append(len(obs))
+            return predict(obs, *args)
+
+        return call
+
+    members: Any = env._seats[0][0]._members
+    for member in members:
+        member._predictor.predict = counted(member._predictor.predict)
     steps = play(env, 28, begin=True)
     assert sum(calls) == 28 * 6 and len(calls) == sum(len(set(names)) for _, names in steps)
     for copy in range(6):
