@@ -121,6 +121,20 @@ def partners_hint(scripted: Collection[str], env_agents: Collection[str]) -> str
     )
 
 
+def check_learners(partners: Collection[str], **given: Any) -> None:
+    """
+    Check that no agent that a partner acts for is to learn.
+
+    :param partners: Names of the agents that partners act for
+    :param given: Arguments of a team that may be dicts by agent, by their names
+    :raises ValueError: If one of them has an entry for such an agent
+    """
+    for name, by_agent in given.items():
+        both = [agent for agent in by_agent if agent in partners] if isinstance(by_agent, Mapping) else []
+        if both:
+            raise ValueError(f"{name} has entries for {both}, but partners act for them: an agent learns or has a partner.")
+
+
 def check_same_agents(
     agents: list[str], scripted: dict[str, str], env_agents: list[str], env_scripted: dict[str, str]
 ) -> None:

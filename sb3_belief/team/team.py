@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.common.rng import RngSwitch, global_rngs_of_this_thread
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team.agent_models import AgentModels, AgentSpec, LoadOptions, env_seed, run_learn, team_rng
-from sb3_belief.team.arguments import as_callback, check_agent_keys, check_team_vec_env, per_agent
+from sb3_belief.team.arguments import as_callback, check_agent_keys, check_learners, check_team_vec_env, per_agent
 from sb3_belief.team.callbacks import check_callbacks
 from sb3_belief.team.checkpoint import read_team, spaces_manifest, write_team
 from sb3_belief.team.exact import ExactTraining, check_exact_load
@@ -100,6 +100,7 @@ class Team(SB3Protocol):
         check_jobs(jobs)
         check_on_nan(on_nan)
         env = with_partners(check_team_vec_env(env), partners)
+        check_learners(partners or (), algo_class=algo_class, policy=policy, agent_kwargs=agent_kwargs)
         loop = JointLoop(env)
         names = loop.possible_agents
         classes, policies = per_agent("algo_class", algo_class, names), per_agent("policy", policy, names)

@@ -261,6 +261,14 @@ def test_wrong_partners(partners, error, message):
         Team(PPO, "MlpPolicy", make_team_env(toy(2)), partners=partners, **PPO_KWARGS)
 
 
+def test_an_agent_learns_or_has_a_partner():
+    both: dict[str, Any]
+    for both in ({"agent_kwargs": {"agent_1": {"n_steps": 16}}}, {"policy": {"agent_0": "MlpPolicy", "agent_1": "MlpPolicy"}}):
+        kwargs = {"algo_class": PPO, "policy": "MlpPolicy", **PPO_KWARGS, **both}
+        with pytest.raises(ValueError, match=r"has entries for \['agent_1'\], but partners act for them"):
+            Team(env=make_team_env(toy(2)), partners={"agent_1": zero}, **kwargs)
+
+
 def test_partners_that_do_not_fit(tmp_path):
     junction = Team(PPO, "MlpPolicy", make_team_env(EASY), seed=0, **PPO_KWARGS).agents["car_1"]
     with pytest.raises(ValueError, match="'agent_1' has been made for the observation space"):
