@@ -9,7 +9,7 @@ from pettingzoo import ParallelEnv
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.envs.registry import make_batched_env, spec
 from sb3_belief.vec_env.joint_env import JointEnv, Visibility
-from sb3_belief.vec_env.observe_last import ObserveLastVecEnv
+from sb3_belief.vec_env.observe_last import with_last_step
 from sb3_belief.vec_env.parallel_team_vec_env import ParallelTeamVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
@@ -85,12 +85,7 @@ def make_team_env(
     if team_env is None:
         make_copies = [partial(_make_joint, make_one, wrapper, visibility, copy) for copy in range(n_envs)]
         team_env = ParallelTeamVecEnv(make_copies, vec_env == "subproc", step_timeout, restart_workers)
-    if observe_last is not False or partner_starts is not False:
-        try:
-            team_env = ObserveLastVecEnv(team_env, observe_last, partner_starts)
-        except BaseException:
-            team_env.close()
-            raise
+    team_env = with_last_step(team_env, observe_last, partner_starts)
     if seed is not None:
         team_env.seed(seed)
     return team_env

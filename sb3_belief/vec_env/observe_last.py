@@ -208,6 +208,26 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
         self._partners = state["partners"]
 
 
+def with_last_step(
+    env: TeamVecEnv, observe_last: bool | Sequence[str] = False, partner_starts: bool | Sequence[str] = False
+) -> TeamVecEnv:
+    """
+    Let agents observe besides what an :class:`ObserveLastVecEnv` adds.
+
+    :param env: Environment of a team, which is closed if it cannot be
+    :param observe_last: As for ``ObserveLastVecEnv``
+    :param partner_starts: As for ``ObserveLastVecEnv``
+    :return: The environment, as it is if nothing is asked for
+    """
+    if observe_last is False and partner_starts is False:
+        return env
+    try:
+        return ObserveLastVecEnv(env, observe_last, partner_starts)
+    except BaseException:
+        env.close()
+        raise
+
+
 def _chosen(name: str, given: bool | Sequence[str], agents: Sequence[str]) -> list[str]:
     if isinstance(given, bool):
         return list(agents) if given else []

@@ -42,10 +42,14 @@ class TeamVecEnvWrapper(TeamVecEnv):
         return getattr(self.venv, "n_restarts", 0)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        return self.venv.seed(seed)
+        self._seeds = list(self.venv.seed(seed))
+        return self._seeds
 
     def set_options(self, options: list[dict] | dict | None = None) -> None:
         self.venv.set_options(options)
+
+    def begin_rollout(self) -> None:
+        self.venv.begin_rollout()
 
     def action_masks(self) -> dict[str, np.ndarray] | None:
         return self.venv.action_masks()

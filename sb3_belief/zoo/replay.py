@@ -12,6 +12,7 @@ from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.envs.registry import make_parallel_env, spec
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.checkpoint import read_team
+from sb3_belief.vec_env.observe_last import with_last_step
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_call
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError, cause
@@ -156,9 +157,10 @@ def team_in_its_environment(
     :raises ConfigError: If the environment refuses its settings, or the team cannot be loaded
     """
     with _refusals_as_config_errors(shown, command):
-        env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper, **shown.observation)
+        env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
         if shown.partners is not None:
             env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
+        env = with_last_step(env, **shown.observation)
     try:
         try:
             trust = Trust.of(saved.trust, saved.extra_packages)

@@ -135,14 +135,7 @@ class SettingsChecker:
         if key == "policy" and value not in self.policies:
             raise unknown_setting(location.text, "policy", value, self.policies)
         if key == "policy_kwargs" and self.policy_class is not None:
-            checked = check_call(self.policy_class, value, location, reserved=self.policy_reserved)
-            networks = checked.get("net_arch")
-            # SB3 makes no network of a name that it does not know, and says nothing
-            names = ("pi", "vf" if issubclass(self.algo_class, OnPolicyAlgorithm) else "qf")
-            for name in networks if isinstance(networks, dict) else ():
-                if name not in names:
-                    raise unknown_setting(location.key("net_arch").text, "network", name, names)
-            return checked
+            return self._check_policy_kwargs(value, location)
         if key == "normalize" and isinstance(value, dict):
             return check_call(VecNormalize, value, location, skip=1)
         if key in ("env_kwargs", "eval_env_kwargs"):
@@ -161,6 +154,16 @@ class SettingsChecker:
                 check_limits(kwargs, location.key(callback.__name__).text)
             return callbacks
         return value
+
+    def _check_policy_kwargs(self, value: Any, location: Location) -> dict[str, Any]:
+        checked = check_call(self.policy_class, value, location, reserved=self.policy_reserved)
+        networks = checked.get("net_arch")
+        # SB3 makes no network of a name that it does not know, and says nothing
+        names = ("pi", "vf" if issubclass(self.algo_class, OnPolicyAlgorithm) else "qf")
+        for name in networks if isinstance(networks, dict) else ():
+            if name not in names:
+                raise unknown_setting(location.key("net_arch").text, "network", name, names)
+        return checked
 
     def _check_calls(
         self, value: Any, location: Location, skip: int = 0, check: Callable[[Any, Location], None] | None = None

@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
+from sb3_belief.vec_env.observe_last import with_last_step
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.endings import EndSignals
 from sb3_belief.zoo.errors import ConfigError, cause
@@ -220,14 +221,19 @@ def make_env(
             env_kwargs=config.env_kwargs,
             wrapper=config.wrapper,
             visibility=config.visibility,
-            **config.observation,
             **faults,
         )
     # An environment of the user's own may raise anything, and any settings may be more than the memory holds
     except Exception as error:
         reason = cause(error)
         raise ConfigError(f"{config.origin(reason)}: {config.env_id} refuses its settings: {reason}") from error
-    return env if config.partners is None else with_config_partners(config, env, evaluation, trust_pickle)
+    if config.partners is not None:
+        env = with_config_partners(config, env, evaluation, trust_pickle)
+    try:
+        # Around the partners, who observe what they have learned with
+        return with_last_step(env, **config.observation)
+    except ValueError as error:
+        raise ConfigError(f"{config.source}: {config.env_id}: {error}") from error
 
 
 def with_config_partners(config: RunConfig, env: TeamVecEnv, evaluation: bool, trust_pickle: bool) -> TeamVecEnv:

@@ -8,10 +8,12 @@ import pytest
 import yaml
 
 from sb3_belief.cli.main import main, train_main
+from sb3_belief.team import make_team_env
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.partners import check_partners, partners_of_flag
+from sb3_belief.zoo.train import make_env
 from tests.zoo.runs import table
 
 EASY = "traffic-junction-easy"
@@ -27,9 +29,14 @@ def drive(obs):
     return 0
 
 
-def train(folder, *words, params=()):
+def plain_observer(obs):
+    assert make_team_env(EASY).observation_space["car_1"].contains(obs)
+    return 0
+
+
+def train(folder, *words, params=(), algo="ppo"):
     flags = ["--env", EASY, "--seed", "3", "-f", str(folder), "--verbose", "0", "-n", "160", "--allow-package", "tests"]
-    return train_main(["--algo", "ppo", *flags, "-params", *TINY, *params, *words])
+    return train_main(["--algo", algo, *flags, "-params", *TINY, *params, *words])
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +89,33 @@ def test_a_run_records_its_partners_and_goes_on_with_them(runs, partnered, capsy
     assert yaml.safe_load((partnered / "config.yml").read_text())[EASY]["partners"] == recorded
     with np.load(partnered / "evaluations.npz") as data:
         assert data["timesteps"].tolist() == [80, 160, 240]
+
+
+def test_learners_observe_their_last_step_and_partners_do_not(tmp_path, capsys):
+    """Who is told of another partner is told of those of the pool."""
+    content = {"learners": "car_0", "members": {"a": f"{HERE}:plain_observer", "b": f"{HERE}:brake"}, "redraw_every": 2}
+    params = ["observe_last:true", "memory_span:partner", "policy_kwargs.lstm_hidden_size:8"]
+    words = [*("--partners", write(tmp_path / "partners.yml", content)), *("--eval-freq", "80", "--eval-episodes", "2")]
+    assert train(tmp_path / "logs", *words, params=params, algo="recurrent_ppo") == 0
+    run = tmp_path / "logs" / "recurrent_ppo" / f"{EASY}_1"
+    config = load_config("recurrent_ppo", EASY, str(run / "config.yml"), extra_packages=("tests",))
+    env = make_env(config, 3, 0)
+    plain = make_team_env(EASY).observation_space["car_0"]
+    assert env.possible_agents == ["car_0"] and env.unwrapped is env
+    # Of each of the four others two actions and whether it was seen, of its own two, and the reward
+    assert env.observation_space["car_0"]["observation"].shape == (plain.shape[0] + 4 * 3 + 2 + 1,)
+    env.reset()
+    before, changes = env.get_attr("partner"), []
+    for _ in range(20 * 4):
+        obs = env.step({"car_0": np.ones(3, dtype=int)})[0]
+        now = env.get_attr("partner")
+        assert obs["car_0"]["memory_start"][:, 0].tolist() == [old != new for old, new in zip(before, now, strict=True)]
+        changes += [old != new for old, new in zip(before, now, strict=True)]
+        before = now
+    assert any(changes)
+    capsys.readouterr()
+    assert main(["enjoy", str(run), "--episodes", "1", "--allow-package", "tests"]) == 0
+    assert "Episode 1: return" in capsys.readouterr().out
 
 
 def test_enjoy_finds_the_partners_or_is_given_others(runs, partnered, tmp_path, capsys):
@@ -157,6 +191,6 @@ def test_wrong_files_and_functions_of_strangers(tmp_path):
         partners_of_flag(write(tmp_path / "list.yml", ["a"]))
     # The file of a run may be a stranger's: any function would be called with what the environment says
     stranger = Location("config.yml: partners", run_folder=tmp_path)
-    with pytest.raises(ConfigError, match="may name no function of 'stable_baselines3.common.utils'"):
+    with pytest.raises(ConfigError, match=r"may name no function of 'stable_baselines3\.common\.utils'"):
         check_partners({"members": {"a": "stable_baselines3.common.utils:set_random_seed"}}, stranger)
     assert check_partners(None, stranger) is None
