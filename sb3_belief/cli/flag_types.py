@@ -2,6 +2,8 @@
 
 import argparse
 
+from sb3_belief.zoo.durations import DURATION, seconds_of
+
 # The largest numbers that make sense; beyond them numpy, torch or the system fail in ways of their own
 _MOST, _MOST_SEED, _MOST_THREADS, _MOST_FPS = 10**15, 2**31 - 1, 1024, 1000
 
@@ -56,16 +58,10 @@ def duration_or_off(text: str) -> float:
     :param text: The word on the command line: a number of seconds, or with a unit: ``90s``, ``10m``, ``2h``
     :return: Seconds, or -1 for never
     """
-    if text == "-1":
-        return -1
-    unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:], 0)
     try:
-        seconds = float(text[:-1]) * unit if unit else float(text)
-        if 0 < seconds <= _MOST:
-            return seconds
+        return seconds_of(text)
     except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"must be a time such as 90s, 10m or 2h, or -1 for never, not {text[:40]!r}")
+        raise argparse.ArgumentTypeError(f"must be {DURATION}, not {text[:40]!r}") from None
 
 
 def seed_number(text: str) -> int:

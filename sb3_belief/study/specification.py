@@ -12,6 +12,7 @@ from typing import Any
 
 from sb3_belief.study.yaml_rows import Section, read_sections
 from sb3_belief.zoo.config import RunConfig, load_config
+from sb3_belief.zoo.durations import DURATION, seconds_of
 from sb3_belief.zoo.errors import short
 from sb3_belief.zoo.names import ALGOS, load_env
 from sb3_belief.zoo.run_folder import folder_name
@@ -28,7 +29,6 @@ TRAIN_KEYS = (
     *("vec_env", "step_timeout", "restart_workers"),
 )
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
-_UNITS = {"": 1, "s": 1, "m": 60, "h": 3600}
 
 
 @dataclass(frozen=True)
@@ -319,10 +319,9 @@ def _train_options(section: Section) -> dict[str, Any]:
 
 def _duration(section: Section) -> float:
     """Return a number of seconds, which may be written with a unit; -1 for never."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", str(section.value).strip())
-    seconds = float(match[1]) * _UNITS[match[2]] if match is not None else 0.0
-    if str(section.value) == "-1":
-        return -1.0
-    if isinstance(section.value, bool) or not 0 < seconds <= _MOST:
-        raise section.error(f"must be a time such as 90s, 10m or 2h, or -1 for never, not {short(section.value)}.")
-    return seconds
+    try:
+        if isinstance(section.value, int | float | str) and not isinstance(section.value, bool):
+            return seconds_of(str(section.value))
+    except ValueError:
+        pass
+    raise section.error(f"must be {DURATION}, not {short(section.value)}.")
