@@ -93,6 +93,18 @@ def start_cell(cell: Cell, extra_packages: tuple[str, ...], output: IO[bytes]) -
     )
 
 
+def output_end(output: IO[bytes]) -> str:
+    """
+    Return the end of what a cell has written.
+
+    :param output: The file that took it
+    :return: At most 4,000 bytes, as text
+    """
+    size = output.seek(0, os.SEEK_END)
+    output.seek(max(size - _TAIL, 0))
+    return output.read().decode(errors="replace").strip()
+
+
 def run_local(cells: Sequence[Cell], jobs: int, display: Display, extra_packages: tuple[str, ...] = ()) -> EngineResult:
     """
     Run all cells that have neither finished nor failed, and wait for those that other processes run.
@@ -173,9 +185,7 @@ class _Pool:
         assert each.process.stdin is not None
         each.process.stdin.close()
         with each.output as output:
-            size = output.seek(0, os.SEEK_END)
-            output.seek(max(size - _TAIL, 0))
-            text = output.read().decode(errors="replace").strip()
+            text = output_end(output)
         if status == BUSY:
             # Another study was quicker
             self._waiting.append(cell)

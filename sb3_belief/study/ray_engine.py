@@ -19,7 +19,7 @@ from typing import Any
 from sb3_belief.common.durable_files import replaced_file
 from sb3_belief.study.cell import BUSY
 from sb3_belief.study.cell_record import FAILED, FINISHED, Cell
-from sb3_belief.study.engine import Display, EngineResult, start_cell
+from sb3_belief.study.engine import Display, EngineResult, output_end, start_cell
 from sb3_belief.zoo.endings import EndSignals
 from sb3_belief.zoo.errors import ConfigError
 
@@ -29,7 +29,6 @@ TOKEN_FILE = ".shared"
 _RETRIES = 10
 # Seconds between looks at the tasks, and at a cell that another process runs
 _POLL, _POLL_OTHERS = 0.5, 2.0
-_TAIL = 4000
 
 
 def run_on_ray(
@@ -140,9 +139,7 @@ def run_cell_in_task(cell_folder: str, folder: str, token: str, extra_packages: 
         with tempfile.TemporaryFile() as output:
             process = start_cell(cell, extra_packages, output)
             status = process.wait()
-            size = output.seek(0, 2)
-            output.seek(max(size - _TAIL, 0))
-            lines = output.read().decode(errors="replace").strip().splitlines()
+            lines = output_end(output).splitlines()
         if status != BUSY:
             break
         # Of a lost node, whose cell still saves, or of another study
