@@ -1,7 +1,18 @@
-"""Notes on exceptions, also for Python 3.10, which does not have them yet."""
+"""Messages of exceptions, and notes on them, also for Python 3.10, which does not have these yet."""
 
 import sys
 import warnings
+
+
+def first_line(error: BaseException) -> str:
+    """
+    Return the first line of an error's message, for a sentence that goes on after it.
+
+    :param error: The error
+    :return: The line without a full stop; the name of the error's type if it has no message
+    """
+    lines = str(error).strip().splitlines()
+    return lines[0].strip().rstrip(".") if lines else type(error).__name__
 
 
 def add_note(error: BaseException, note: str) -> None:

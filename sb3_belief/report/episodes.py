@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.common.durable_files import replaced_file
+from sb3_belief.common.exceptions import first_line
 
 try:
     import pyarrow as pa
@@ -180,7 +181,7 @@ def _read(path: Path) -> pa.Table:
         # read_table() would take columns from names of folders, such as "lr=0.1"
         table = pq.ParquetFile(path).read() if path.suffix == ".parquet" else _read_csv(path)
     except pa.ArrowException as error:
-        raise ValueError(f"{path}: is damaged ({_first_line(error)}): write it again or leave it out.") from error
+        raise ValueError(f"{path}: is damaged ({first_line(error)}): write it again or leave it out.") from error
     return _checked(table, str(path))
 
 
@@ -196,11 +197,6 @@ def _read_csv(path: Path) -> pa.Table:
     return pa_csv.read_csv(pa.BufferReader(data), convert_options=options)
 
 
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0].rstrip(".") if lines else type(error).__name__
-
-
 def _checked(table: pa.Table, where: str) -> pa.Table:
     """Return a table in the types and order of the schema, or refuse it."""
     missing = [name for name in EPISODES.names if name not in table.column_names]
@@ -214,7 +210,7 @@ def _checked(table: pa.Table, where: str) -> pa.Table:
         table = table.select(EPISODES.names).cast(EPISODES)
     # A missing value where none may be is a ValueError too
     except (pa.ArrowException, ValueError) as error:
-        raise ValueError(f"{where}: has a value of another type than its column's ({_first_line(error)}).") from error
+        raise ValueError(f"{where}: has a value of another type than its column's ({first_line(error)}).") from error
     for name in EPISODES.names:
         if name != "success" and table[name].null_count:
             raise ValueError(f"{where}: {table[name].null_count} rows have no {name}; only success may be missing.")

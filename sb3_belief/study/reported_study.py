@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 import yaml
 
+from sb3_belief.common.exceptions import first_line
 from sb3_belief.report.episodes import EPISODES, read_episodes_table
 from sb3_belief.study.cell_record import CELL_RECORD, CELLS, EPISODES_FILE
 from sb3_belief.study.reported import Reported, ReportedRun
@@ -84,8 +85,9 @@ def _specification(path: Path) -> dict[str, Any]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"{path}: is damaged ({reason}): run sb3-belief study again, which writes it anew.") from None
+        raise ConfigError(
+            f"{path}: is damaged ({first_line(error)}): run sb3-belief study again, which writes it anew."
+        ) from None
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: is damaged: it is no mapping. Run sb3-belief study again, which writes it anew.")
     return data

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from sb3_belief.common.exceptions import first_line
 from sb3_belief.team import Team
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of, short
 from sb3_belief.zoo.model_card import CardContent, model_card
@@ -202,25 +203,20 @@ def _refusals(command: str, repo_id: str) -> Iterator[None]:
         yield
     except (errors.RepositoryNotFoundError, errors.GatedRepoError) as error:
         raise ConfigError(
-            f"{command}: the hub shows no repository {repo_id} ({_first_line(error)}). A private one, or a gated one, needs a"
+            f"{command}: the hub shows no repository {repo_id} ({first_line(error)}). A private one, or a gated one, needs a"
             " token: hf auth login, or HF_TOKEN."
         ) from error
     except errors.RevisionNotFoundError as error:
-        raise ConfigError(f"{command}: {repo_id} has no such revision ({_first_line(error)}).") from error
+        raise ConfigError(f"{command}: {repo_id} has no such revision ({first_line(error)}).") from error
     except errors.HfHubHTTPError as error:
         status = getattr(error.response, "status_code", None)
         token = " A token with the right to write: hf auth login, or HF_TOKEN." if status in (401, 403) else ""
-        raise RunFailed(f"{command}: the hub has refused it ({_first_line(error)}).{token}") from error
+        raise RunFailed(f"{command}: the hub has refused it ({first_line(error)}).{token}") from error
     except ConfigError:
         raise
     # Whatever a network, and the package that speaks with it, fails with
     except Exception as error:
         raise RunFailed(f"{command}: the hub cannot be reached, or answers something else: {cause(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines[0] if lines else type(error).__name__).rstrip(".")
 
 
 def _remove_empty(folder: Path, until: Path) -> None:
