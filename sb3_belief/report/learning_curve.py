@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_belief.report.evaluations import read_evaluations
+
 INK, CURVE, GREEDY = "#333333", "#1f6f8b", "#c8553d"
 #: The quantities that a curve can show, with the labels of their axes
 QUANTITIES = {"return": "team return per episode", "success": "success rate"}
@@ -47,28 +49,6 @@ def read_monitor(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
     numbers = {"True": 1.0, "False": 0.0}
     successes = np.array([numbers.get(row.get("is_success", ""), np.nan) for row in rows])
     return np.cumsum(lengths), returns, successes
-
-
-def read_evaluations(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """
-    Read ``evaluations.npz``, which SB3's ``EvalCallback`` writes.
-
-    :param folder: Folder of a run
-    :return: Joint steps ``[k]``, mean returns ``[k]`` and success rates ``[k]`` (NaN if the environment does not report
-        them) of the team when it acts greedily. None if it was never evaluated
-    :raises ValueError: If the file is damaged
-    """
-    path = Path(folder) / "evaluations.npz"
-    if not path.is_file():
-        return None
-    try:
-        with np.load(path) as data:
-            returns = data["results"].mean(axis=1)
-            successes = data["successes"].mean(axis=1) if "successes" in data else np.full(len(returns), np.nan)
-            return data["timesteps"].astype(float), returns, successes
-    # A damaged file makes numpy and zipfile raise whatever they raise
-    except Exception as error:
-        raise ValueError(f"{path}: is damaged ({error}): remove it to draw the curve without evaluations.") from error
 
 
 class Part(NamedTuple):
@@ -250,9 +230,9 @@ def plot_learning_curve(
         evaluations = read_evaluations(part.folder)
         if evaluations is not None:
             # SB3 counts the joint steps of evaluations on from those of the run before
-            kept = evaluations[0] <= part.end
-            greedy = (evaluations[2] if of_success else evaluations[1])[kept]
-            axes.plot(evaluations[0][kept], greedy, color=GREEDY, marker="o", ms=4.5, lw=1.2, label=label)
+            kept = evaluations.steps <= part.end
+            greedy = (evaluations.success_rates if of_success else evaluations.mean_returns)[kept]
+            axes.plot(evaluations.steps[kept], greedy, color=GREEDY, marker="o", ms=4.5, lw=1.2, label=label)
             label = None
     for name, value in (bars or {}).items():
         axes.axhline(value, color=INK, lw=0.9, ls=(0, (5, 4)), alpha=0.6, zorder=0)

@@ -10,13 +10,14 @@ import numpy as np
 import torch as th
 
 from sb3_belief.common.safe_files.trust import Trust
+from sb3_belief.report.evaluations import episode_columns, read_evaluations
 from sb3_belief.report.learning_curve import read_monitor
 from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.errors import cause
 from sb3_belief.zoo.evaluate import evaluate
-from sb3_belief.zoo.run_folder import BEST_MODEL, EVALUATIONS, TEAM, read_record
+from sb3_belief.zoo.run_folder import BEST_MODEL, TEAM, read_record
 from sb3_belief.zoo.train import make_env
 
 
@@ -92,35 +93,26 @@ def online_rows(run: Path, every: int, n_final: int) -> list[dict[str, Any]]:
         inside = (ends > first) & (ends <= first + every)
         kind = {"phase": "training", "checkpoint": "current", "deterministic": False, "joint_steps": first + every}
         rows += [
-            {**kind, **each} for each in _numbered(returns[inside], None if won is None else won[inside], lengths[inside])
+            {**kind, **each}
+            for each in episode_columns(returns[inside], None if won is None else won[inside], lengths[inside])
         ]
     last = slice(max(len(ends) - n_final, 0), None)
     kind = {"phase": "final", "checkpoint": "last", "deterministic": False, "joint_steps": int(ends[-1]) if len(ends) else 0}
-    return rows + [{**kind, **each} for each in _numbered(returns[last], None if won is None else won[last], lengths[last])]
+    return rows + [
+        {**kind, **each} for each in episode_columns(returns[last], None if won is None else won[last], lengths[last])
+    ]
 
 
 def _training_rows(run: Path) -> tuple[list[dict[str, Any]], int | None, bool]:
     """Return the rows of the evaluations during the training, the steps of the best, and whether they have successes."""
-    path = run / EVALUATIONS
-    if not path.is_file():
-        return [], None, False
     try:
-        with np.load(path) as data:
-            steps, returns, lengths = data["timesteps"], data["results"], data["ep_lengths"]
-            successes = data["successes"] if "successes" in data else None
-        if not len(steps) == len(returns) == len(lengths):
-            raise ValueError("its parts have unequal lengths")
-    # A damaged file makes zipfile and numpy raise whatever they raise
-    except Exception as error:
-        raise ValueError(f"{path} is damaged ({cause(error)}): move the folder of the run away to train it again.") from error
-    rows = []
-    for index, joint_steps in enumerate(steps):
-        kind = {"phase": "training", "checkpoint": "current", "deterministic": True, "joint_steps": int(joint_steps)}
-        won = None if successes is None or len(successes[index]) != len(returns[index]) else successes[index]
-        rows += [{**kind, **each} for each in _numbered(returns[index], won, lengths[index])]
-    # As SB3's EvalCallback decides: a later evaluation must be better
-    best = int(steps[np.argmax(returns.mean(axis=1))]) if len(steps) and (run / BEST_MODEL).is_file() else None
-    return rows, best, successes is not None
+        evaluations = read_evaluations(run)
+    except ValueError as error:
+        raise ValueError(f"{error}: move the folder of the run away to train it again.") from error
+    if evaluations is None:
+        return [], None, False
+    best = int(evaluations.steps[evaluations.best]) if (run / BEST_MODEL).is_file() else None
+    return evaluations.rows(), best, evaluations.successes is not None
 
 
 def _load(path: Path, env: TeamVecEnv, device: str, extra_packages: tuple[str, ...]) -> Team:
@@ -139,16 +131,4 @@ def _play(team: Team, env: TeamVecEnv, n_episodes: int, deterministic: bool, see
     env.seed(seed)
     outcome = evaluate(team, env, n_episodes, deterministic)
     won = outcome.successes if outcome.successes.size == outcome.returns.size else None
-    return _numbered(outcome.returns, won, outcome.lengths)
-
-
-def _numbered(returns: Any, successes: Any, lengths: Any) -> list[dict[str, Any]]:
-    return [
-        {
-            "episode": index,
-            "episode_return": float(each),
-            "success": None if successes is None else float(successes[index]),
-            "length": int(lengths[index]),
-        }
-        for index, each in enumerate(returns)
-    ]
+    return episode_columns(outcome.returns, won, outcome.lengths)

@@ -10,7 +10,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from sb3_belief.report.learning_curve import read_episodes, read_evaluations
+from sb3_belief.report.evaluations import read_evaluations
+from sb3_belief.report.learning_curve import read_episodes
 from sb3_belief.study.groups import LENGTH, labels
 from sb3_belief.study.run_reading import DAMAGED, RunData, read_run, run_folders
 from sb3_belief.zoo.errors import ConfigError, short
@@ -72,8 +73,8 @@ def _last_score(folder: Path) -> str:
     """Return the mean of the last evaluation, or else that of the last episodes of the training."""
     try:
         evaluations = read_evaluations(folder)
-        if evaluations is not None and len(evaluations[0]):
-            return _score(evaluations[1][-1], evaluations[2][-1], "")
+        if evaluations is not None:
+            return _score(evaluations.mean_returns[-1], evaluations.success_rates[-1], "")
         _, returns, successes = read_episodes(folder)
     except (OSError, ValueError) as error:
         return "damaged" if "damaged" in str(error) else "-"

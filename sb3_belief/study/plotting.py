@@ -7,10 +7,11 @@ import numpy as np
 
 from sb3_belief.common.durable_files import make_folder
 from sb3_belief.report.comparison import binned
+from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.report.figures.curves import Curve, curves_spec
 from sb3_belief.report.figures.drawing import check_drawing
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
-from sb3_belief.report.learning_curve import QUANTITIES, read_episodes, read_evaluations
+from sb3_belief.report.learning_curve import QUANTITIES, read_episodes
 from sb3_belief.report.page.content import unique_name
 from sb3_belief.report.page.files import FIGURE_FORMATS, write_figure
 from sb3_belief.report.study_page.facts import Series, curve_of, thinned
@@ -93,8 +94,8 @@ def _series(runs: Sequence[RunData], quantity: str | None) -> tuple[dict[Path, S
     try:
         for run in runs:
             read = read_evaluations(run.folder)
-            if read is not None and len(read[0]) > 1:
-                evaluations[run.folder] = read
+            if read is not None and len(read.steps) > 1:
+                evaluations[run.folder] = read.steps, read.mean_returns, read.success_rates
         greedy = len(evaluations) == len(runs)
         for run in runs if not greedy else []:
             try:

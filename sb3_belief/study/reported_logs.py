@@ -1,19 +1,18 @@
 """Runs without a study: which of them compare, and the table of the episodes of their evaluations."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from sb3_belief.report.episodes import EPISODES
+from sb3_belief.report.evaluations import EVALUATIONS, read_evaluations
 from sb3_belief.study.groups import labels
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.run_reading import RunData, read_run, run_folders
-from sb3_belief.zoo.errors import ConfigError, cause, short
-from sb3_belief.zoo.run_folder import EVALUATIONS
+from sb3_belief.zoo.errors import ConfigError, short
 
 
 def reported_logs(folder: Path) -> Reported:
@@ -39,7 +38,7 @@ def reported_logs(folder: Path) -> Reported:
             runs[index] = replace(run, why_not="a newer run has the same settings and seed")
         elif not run.why_not:
             try:
-                own = list(_rows(run, folder.name))
+                own = _rows(run, folder.name)
             except ValueError as error:
                 own, why = [], str(error)
             else:
@@ -78,38 +77,20 @@ def _newest(runs: Sequence[ReportedRun]) -> dict[tuple[str, str, int | None], Re
     return found
 
 
-def _rows(run: ReportedRun, study: str) -> Iterator[dict[str, Any]]:
-    """Iterate over the episodes of a run's evaluations."""
-    path = run.data.folder / EVALUATIONS
-    if not path.is_file():
-        return
+def _rows(run: ReportedRun, study: str) -> list[dict[str, Any]]:
+    """Return the episodes of a run's evaluations."""
     try:
-        with np.load(path) as data:
-            steps, returns, lengths = data["timesteps"], data["results"], data["ep_lengths"]
-            successes = data["successes"] if "successes" in data else None
-    # A damaged file makes zipfile and numpy raise whatever they raise
-    except Exception as error:
-        raise ValueError(f"its {EVALUATIONS} is damaged ({cause(error)})") from error
-    for index, joint_steps in enumerate(steps):
-        won = (
-            None if successes is None or len(successes) <= index or len(successes[index]) != len(returns[index]) else successes
-        )
-        for episode, value in enumerate(returns[index]):
-            yield {
-                "study": study,
-                "arm": run.arm,
-                "algorithm": run.data.algo,
-                "environment": run.data.env,
-                "seed": run.data.seed,
-                "phase": "training",
-                "checkpoint": "current",
-                "deterministic": True,
-                "joint_steps": int(joint_steps),
-                "episode": episode,
-                "episode_return": float(value),
-                "success": None if won is None else float(won[index][episode]),
-                "length": int(lengths[index][episode]),
-            }
+        evaluations = read_evaluations(run.data.folder)
+    except ValueError as error:
+        raise ValueError(f"its {EVALUATIONS} is damaged ({error.__cause__})") from error
+    common = {
+        "study": study,
+        "arm": run.arm,
+        "algorithm": run.data.algo,
+        "environment": run.data.env,
+        "seed": run.data.seed,
+    }
+    return [] if evaluations is None else [{**common, **row} for row in evaluations.rows()]
 
 
 def _common(runs: Sequence[RunData], option: str) -> int | None:

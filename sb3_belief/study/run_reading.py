@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sb3_belief.report.learning_curve import read_episodes, read_evaluations, smooth
+from sb3_belief.report.evaluations import read_evaluations
+from sb3_belief.report.learning_curve import read_episodes, smooth
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, Series
 from sb3_belief.zoo.run_folder import CONFIG, RECORD
 from sb3_belief.zoo.run_lock import LOCK
@@ -119,7 +120,8 @@ def evaluation_series(folder: Path, quantity: str) -> dict[str, Series]:
     try:
         evaluations = read_evaluations(folder)
         if evaluations is not None:
-            found["evaluations, greedy"] = evaluations[0], evaluations[column]
+            values = evaluations.success_rates if quantity == "success" else evaluations.mean_returns
+            found["evaluations, greedy"] = evaluations.steps, values
     except ValueError:
         # The page says so, see ``reporting``
         pass

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.study.trials_table import write_best, write_trials
 from sb3_belief.study.tuning_spec import TuningSpec
 from sb3_belief.study.tuning_storage import Storage
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of
 from sb3_belief.zoo.preflight import check_folder
-from sb3_belief.zoo.run_folder import EVALUATIONS
 from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train import train
 from sb3_belief.zoo.train_options import TrainOptions
@@ -245,8 +245,9 @@ def _train_seeds(
 
 
 def _score(run: Path, spec: TuningSpec) -> float:
-    with np.load(run / EVALUATIONS) as data:
-        values = data["results" if spec.objective == "return" else "successes"]
+    evaluations = read_evaluations(run)
+    assert evaluations is not None
+    values = evaluations.mean_returns if spec.objective == "return" else evaluations.success_rates
     return float(np.mean(values[-spec.last_evaluations :]))
 
 

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_belief.common.exceptions import first_line
+from sb3_belief.report.evaluations import EVALUATIONS
 from sb3_belief.team import Team
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of, short
 from sb3_belief.zoo.model_card import CardContent, model_card
 from sb3_belief.zoo.preflight import check_folder
-from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, EVALUATIONS, RECORD, TEAM, find_team, read_record, run_of_record
+from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, RECORD, TEAM, find_team, read_record, run_of_record
 from sb3_belief.zoo.run_score import run_scores
 from sb3_belief.zoo.yaml_data import read_file
 

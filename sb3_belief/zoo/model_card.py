@@ -4,7 +4,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, EVALUATIONS, TEAM, folder_name
+from sb3_belief.report.evaluations import EVALUATIONS
+from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, TEAM, folder_name
 from sb3_belief.zoo.run_score import LEVEL, RunScore
 from sb3_belief.zoo.settings import observation_arguments
 

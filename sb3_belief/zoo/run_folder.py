@@ -29,7 +29,6 @@ from sb3_belief.zoo.run_files import TEAM as TEAM
 
 CONFIG = "config.yml"
 RECORD = "run.json"
-EVALUATIONS = "evaluations.npz"
 #: The belief viewer, once it has been written
 VIEWER = "viewer.html"
 # How a run ended that can be continued, by its record

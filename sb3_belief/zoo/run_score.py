@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_belief.zoo.errors import ConfigError, cause
-from sb3_belief.zoo.run_folder import EVALUATIONS
+from sb3_belief.report.evaluations import read_evaluations
+from sb3_belief.zoo.errors import ConfigError
 
 #: Share of repetitions in which an interval is to contain the mean
 LEVEL = 0.95
@@ -59,28 +59,19 @@ def run_scores(run: Path) -> tuple[RunScore, RunScore] | None:
     :return: The two scores; None if it was never evaluated
     :raises ConfigError: If its file cannot be read
     """
-    path = run / EVALUATIONS
-    if not path.is_file():
-        return None
     try:
-        with np.load(path, allow_pickle=False) as data:
-            steps, results = data["timesteps"], np.asarray(data["results"], dtype=np.float64)
-            successes = np.asarray(data["successes"], dtype=np.float64) if "successes" in data else None
-        if len(steps) == 0 or len(steps) != len(results):
-            return None
-    # A damaged file makes zipfile and numpy raise whatever they raise
-    except Exception as error:
-        raise ConfigError(f"{path}: cannot be read ({cause(error)}): it is damaged.") from error
-    # As SB3's EvalCallback chooses it: the first of equal ones
-    best = int(np.argmax(results.mean(axis=1)))
+        evaluations = read_evaluations(run)
+    except ValueError as error:
+        raise ConfigError(f"{error}.") from error
+    if evaluations is None:
+        return None
 
     def score(row: int) -> RunScore:
-        # An evaluation during which the environment had not reported any yet has none
-        success = None if successes is None or len(successes) != len(results) else _share(successes[row])
-        returns = results[row]
-        return RunScore(int(steps[row]), len(returns), mean_of_episodes(returns), float(returns.std()), success)
+        returns, successes = evaluations.returns[row], evaluations.successes
+        won = None if successes is None or np.isnan(successes[row]).any() else _share(successes[row])
+        return RunScore(int(evaluations.steps[row]), len(returns), mean_of_episodes(returns), float(returns.std()), won)
 
-    return score(-1), score(best)
+    return score(-1), score(evaluations.best)
 
 
 def mean_of_episodes(values: np.ndarray) -> MeanWithInterval:

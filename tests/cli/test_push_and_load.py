@@ -18,6 +18,7 @@ import yaml
 from sb3_belief.cli.main import main
 from sb3_belief.zoo.run_score import run_scores
 from tests.cli.fake_hub import TOKEN, fake_hub
+from tests.study.folders import write_evaluations
 from tests.zoo.runs import parameters, train
 
 huggingface_hub = pytest.importorskip("huggingface_hub", reason="the hub's tests need it: pip install 'sb3-belief[hub]'")
@@ -143,7 +144,7 @@ def test_the_intervals_are_those_of_the_episodes(tmp_path):
     results = np.stack([rng.normal(2, 1, 400), rng.normal(1, 2, 400)])
     successes = np.zeros((2, 400), dtype=bool)
     successes[1, :100] = True
-    np.savez(tmp_path / "evaluations.npz", timesteps=[10, 20], results=results, successes=successes)
+    write_evaluations(tmp_path, [10, 20], results, successes)
     scores = run_scores(tmp_path)
     assert scores is not None
     last, best = scores

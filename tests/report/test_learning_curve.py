@@ -3,7 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from sb3_belief.report.learning_curve import plot_learning_curve, read_episodes, read_evaluations, read_monitor, smooth
+from sb3_belief.report.learning_curve import plot_learning_curve, read_episodes, read_monitor, smooth
+from tests.study.folders import write_evaluations
 
 HEADER = '#{"t_start": 0.0, "env_id": "Team"}\nr,l,t,is_success\n'
 
@@ -24,15 +25,6 @@ def test_monitor_counts_joint_steps_and_successes(tmp_path):
 def test_an_environment_may_report_no_successes(tmp_path):
     (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,\n")
     assert np.isnan(read_monitor(tmp_path)[2]).all()
-    assert read_evaluations(tmp_path) is None
-
-
-def test_evaluations_are_averaged_over_their_episodes(tmp_path):
-    np.savez(tmp_path / "evaluations.npz", timesteps=[10, 20], results=[[1.0, 3.0], [4.0, 4.0]], successes=[[True, False]] * 2)
-    evaluations = read_evaluations(tmp_path)
-    assert evaluations is not None
-    steps, returns, successes = evaluations
-    assert (steps.tolist(), returns.tolist(), successes.tolist()) == ([10, 20], [2.0, 4.0], [0.5, 0.5])
 
 
 def drawn(figures):
@@ -59,7 +51,7 @@ def figures(monkeypatch):
 def test_the_curve_shows_successes_evaluations_and_bars(tmp_path, figures):
     rows = "".join(f"-1.0,20,{i / 10},{i >= 50}\n" for i in range(100))
     (tmp_path / "monitor.csv").write_text(HEADER + rows)
-    np.savez(tmp_path / "evaluations.npz", timesteps=[1000, 2000], results=[[1.0], [2.0]], successes=[[False], [True]])
+    write_evaluations(tmp_path, [1000, 2000], [[1.0], [2.0]], [[False], [True]])
     path = plot_learning_curve(tmp_path, tmp_path / "plots" / "curve.png", bars={"all gas": 0.31})
     assert path.read_bytes().startswith(b"\x89PNG")
     x_label, y_label, (curve, greedy, bar), texts = drawn(figures)
@@ -96,10 +88,6 @@ def test_another_damaged_line_is_named(tmp_path):
     (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n-2.5,2\n0.0,5,0.3,True\n")
     with pytest.raises(ValueError, match=r"monitor\.csv, line 4: '-2\.5,2' is not an episode"):
         read_monitor(tmp_path)
-    (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,True\n")
-    (tmp_path / "evaluations.npz").write_bytes(b"PK cut")
-    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
-        read_evaluations(tmp_path)
 
 
 def test_runs_that_continue_others_share_one_axis(tmp_path, figures):
@@ -113,7 +101,7 @@ def test_runs_that_continue_others_share_one_axis(tmp_path, figures):
         (folder / "monitor.csv").write_text(HEADER + "".join(f"{start + 10 * i + 1}.0,10,0.1,True\n" for i in range(3)))
         record = {"start_timesteps": start, "trained_agent": None if trained is None else str(trained)}
         (folder / "run.json").write_text(json.dumps(record))
-        np.savez(folder / "evaluations.npz", timesteps=[start + 10, start + 30], results=[[start], [start + 1]])
+        write_evaluations(folder, [start + 10, start + 30], [[start], [start + 1]])
     steps, returns, _ = read_episodes(third)
     # A run that was continued from a checkpoint goes on itself; what it did then is another training
     assert steps.tolist() == [10, 20, 30, 40, 50, 60, 70] and returns.tolist() == [1, 11, 21, 31, 41, 51, 61]
@@ -157,17 +145,6 @@ def test_what_is_no_folder_of_a_run_is_named(tmp_path):
     (tmp_path / "monitor.csv").write_bytes(HEADER.encode() + b"\xff,20,0.1,True\n-1.5,20,0.1,True\n")
     with pytest.raises(ValueError, match=r"monitor\.csv, line 3: .* is not an episode"):
         read_monitor(tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"\x93NUMPY"])
-def test_damaged_evaluations_are_named(content, tmp_path):
-    (tmp_path / "evaluations.npz").write_bytes(content)
-    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
-        read_evaluations(tmp_path)
-    np.save(tmp_path / "one.npy", np.zeros(3))
-    (tmp_path / "one.npy").replace(tmp_path / "evaluations.npz")
-    with pytest.raises(ValueError, match=r"evaluations\.npz: is damaged"):
-        read_evaluations(tmp_path)
 
 
 def test_return_or_success_at_choice(tmp_path, figures):

@@ -13,6 +13,13 @@ HEADER = '#{"t_start": 0.0, "env_id": "Team"}\nr,l,t,is_success\n'
 ERROR = 'Traceback (most recent call last):\n  File "<lost>", line 1\nValueError: </script> & <b>no memory</b>'
 
 
+def write_evaluations(folder, steps, returns, successes=None, length=5):
+    """Write the file of a run's evaluations as SB3 does."""
+    known = {} if successes is None else {"successes": successes}
+    lengths = np.full(np.shape(returns), length)
+    np.savez(folder / "evaluations.npz", timesteps=steps, results=returns, ep_lengths=lengths, **known)
+
+
 def write_run(folder, algo, env, seed, chances, status="finished", settings=None, episodes=8, beliefs=False, **record):
     """
     Write the folder of a run that was evaluated each 1,000 joint steps.
@@ -23,13 +30,7 @@ def write_run(folder, algo, env, seed, chances, status="finished", settings=None
     folder.mkdir(parents=True)
     steps = 1000 * np.arange(1, len(chances) + 1)
     won = rng.random((len(chances), episodes)) < np.array(chances)[:, None]
-    np.savez(
-        folder / "evaluations.npz",
-        timesteps=steps,
-        results=won * 2.0 - 1,
-        ep_lengths=np.full(won.shape, 20),
-        successes=won,
-    )
+    write_evaluations(folder, steps, won * 2.0 - 1, won, length=20)
     rows = "".join(f"{2.0 * (rng.random() < chance) - 1},200,0.1,True\n" for chance in chances for _ in range(5))
     (folder / "monitor.csv").write_text(HEADER + rows)
     (folder / "config.yml").write_text(yaml.safe_dump({env: {"n_timesteps": int(steps[-1]), **(settings or {})}}))
