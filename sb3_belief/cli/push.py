@@ -14,7 +14,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
     :param parser: Parser of the command
     """
-    parser.add_argument("run", type=filled_text, help="folder of a run")
+    parser.add_argument("run", type=filled_text, help="folder of a run, or of a cell of a study")
     parser.add_argument("repo_id", type=filled_text, metavar="OWNER/NAME", help="repository, which is made if there is none")
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument("-m", "--message", type=filled_text, default="Add a team", help="message of the commit")
@@ -29,7 +29,10 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     :param _: The words of the command line, unused
     :return: Exit status
     """
+    from sb3_belief.study.pushing import run_to_push
     from sb3_belief.zoo.hub import PushOptions, push_team
 
-    push_team(PushOptions(args.run, args.repo_id, args.private, args.message, tuple(args.allow_package)))
+    folder, final_scores = run_to_push(args.run)
+    packages = tuple(args.allow_package)
+    push_team(PushOptions(str(folder), args.repo_id, args.private, args.message, packages, final_scores))
     return 0

@@ -20,7 +20,7 @@ from sb3_belief.zoo.errors import ConfigError, RunFailed, cause, reason_of, shor
 from sb3_belief.zoo.model_card import CardContent, model_card
 from sb3_belief.zoo.preflight import check_folder
 from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, RECORD, TEAM, find_team, read_record, run_of_record
-from sb3_belief.zoo.run_score import run_scores
+from sb3_belief.zoo.run_score import RunScore, run_scores
 from sb3_belief.zoo.yaml_data import read_file
 
 CARD = "README.md"
@@ -41,6 +41,8 @@ class PushOptions:
     :param private: Whether a new repository is private
     :param message: Message of the commit
     :param extra_packages: See ``Team.load`` (``allow_packages``)
+    :param final_scores: Scores of episodes after the training; that of the best team first. None for those of the run's
+        evaluations
     """
 
     run: str
@@ -48,6 +50,7 @@ class PushOptions:
     private: bool = False
     message: str = "Add a team"
     extra_packages: tuple[str, ...] = ()
+    final_scores: tuple[RunScore, ...] = ()
 
 
 def push_team(options: PushOptions) -> str:
@@ -78,8 +81,10 @@ def push_team(options: PushOptions) -> str:
         read_file(folder / CONFIG).get(record["env"]) or {},
         {agent: type(model).__name__ for agent, model in team.agents.items()},
         team.num_timesteps,
-        run_scores(folder),
+        options.final_scores or run_scores(folder) or (),
         best.is_file(),
+        (folder / EVALUATIONS).is_file(),
+        is_final=bool(options.final_scores),
     )
     files: dict[str, Any] = {
         TEAM: path,

@@ -1,6 +1,7 @@
 """The page that describes a trained team on the Hugging Face hub."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,15 @@ from sb3_belief.zoo.run_folder import BEST_MODEL, CONFIG, TEAM, folder_name
 from sb3_belief.zoo.run_score import LEVEL, RunScore
 from sb3_belief.zoo.settings import observation_arguments
 
+_BRACKETS = (
+    "Brackets are 95 % intervals over the episodes (percentile bootstrap of the return, Wilson's interval of the success rate)"
+    ". They say how well *this* team is known, one run with one seed, and nothing of what the algorithm gives with other"
+    " seeds."
+)
+_OF_BEST = " The best evaluation is the highest of many, so the score of that team is too high on average."
+_OF_FINAL = (
+    " The best team was chosen by its evaluations, not by these episodes, so its score is not too high for that reason."
+)
 TAGS = ("reinforcement-learning", "deep-reinforcement-learning", "multi-agent", "stable-baselines3", "sb3-belief")
 
 
@@ -22,8 +32,11 @@ class CardContent:
     :param settings: Settings of the run, as its configuration file holds them
     :param algorithms: Class of each agent's algorithm, by agent
     :param joint_steps: Joint steps that the team was trained for
-    :param scores: Scores of the last evaluation and of the best one; None if there was none
+    :param scores: Scores, of which the first is in the metadata: of the last evaluation and of the best one, or of the final
+        episodes of the best team and of the last one. Empty for none
     :param with_best: Whether the best model is there too
+    :param with_evaluations: Whether the file of the evaluations is there too
+    :param is_final: Whether the scores are those of final episodes
     """
 
     repo_id: str
@@ -31,8 +44,10 @@ class CardContent:
     settings: dict[str, Any]
     algorithms: dict[str, str]
     joint_steps: int
-    scores: tuple[RunScore, RunScore] | None
+    scores: Sequence[RunScore]
     with_best: bool
+    with_evaluations: bool
+    is_final: bool = False
 
 
 def model_card(content: CardContent) -> str:
@@ -49,24 +64,30 @@ def _metadata(content: CardContent) -> str:
     from huggingface_hub import EvalResult, ModelCardData
 
     env, results = content.record["env"], []
-    if content.scores is not None:
-        last, _ = content.scores
+    if content.scores:
+        first = content.scores[0]
         common: dict[str, Any] = {
             "task_type": "reinforcement-learning",
             "task_name": "reinforcement-learning",
             "dataset_type": folder_name(env),
             "dataset_name": env,
         }
-        arguments = {"episodes": last.n_episodes, "deterministic": True, "joint_steps": last.joint_steps, "level": LEVEL}
+        arguments = {
+            "episodes": first.n_episodes,
+            "deterministic": first.deterministic,
+            "joint_steps": first.joint_steps,
+            "level": LEVEL,
+            "team": first.file,
+        }
         # As SB3's own cards give it, with the standard deviation over episodes
-        value = f"{last.returns.mean:.2f} +/- {last.spread:.2f}"
-        interval = {"interval": _ends(last.returns), "kind": "percentile bootstrap over episodes"}
+        value = f"{first.returns.mean:.2f} +/- {first.spread:.2f}"
+        interval = {"interval": _ends(first.returns), "kind": "percentile bootstrap over episodes"}
         results.append(
             EvalResult(**common, metric_type="mean_reward", metric_value=value, metric_args={**interval, **arguments})
         )
-        if last.success is not None:
-            interval = {"interval": _ends(last.success), "kind": "Wilson, over episodes"}
-            share = round(last.success.mean, 4)
+        if first.success is not None:
+            interval = {"interval": _ends(first.success), "kind": "Wilson, over episodes"}
+            share = round(first.success.mean, 4)
             results.append(
                 EvalResult(**common, metric_type="success_rate", metric_value=share, metric_args={**interval, **arguments})
             )
@@ -100,7 +121,7 @@ def _text(content: CardContent) -> str:
         **({BEST_MODEL: "the team that was best in an evaluation during the training"} if content.with_best else {}),
         CONFIG: "all settings, with which `sb3-belief train --conf-file` repeats the run",
         "run.json": "algorithm, environment, seed and versions",
-        **({EVALUATIONS: "the returns of all evaluations"} if content.scores is not None else {}),
+        **({EVALUATIONS: "the returns of all evaluations"} if content.with_evaluations else {}),
     }
     parts = [
         f"# {repo_id.rpartition('/')[2]}",
@@ -151,23 +172,36 @@ print(score)"""
 
 
 def _score(content: CardContent) -> str:
-    if content.scores is None:
+    if not content.scores:
         return "The run was not evaluated."
-    last, best = content.scores
-    rows = {"": "Mean return" + ("" if last.success is None else " | Success rate")}
-    shown = {f"Last evaluation, at {last.joint_steps:,} joint steps": last}
+    has_successes = content.scores[0].success is not None
+    rows = {"": "Mean return" + (" | Success rate" if has_successes else "")}
+    for score in content.scores:
+        if score.file != BEST_MODEL or content.with_best:
+            rows[_row_name(score, content.is_final)] = f"{score.returns}" + (f" | {score.success}" if has_successes else "")
+    notes = f"{_origin(content)} {_BRACKETS}"
     if content.with_best:
-        shown[f"Best evaluation, at {best.joint_steps:,} joint steps (`{BEST_MODEL}`)"] = best
-    for name, score in shown.items():
-        rows[name] = f"{score.returns}" + ("" if last.success is None else f" | {score.success}")
-    notes = (
-        f"Means over {last.n_episodes} episodes of greedy play on seeds that the training did not use. Brackets are 95 %"
-        " intervals over the episodes (percentile bootstrap of the return, Wilson's interval of the success rate). They say"
-        " how well *this* team is known, one run with one seed, and nothing of what the algorithm gives with other seeds."
-    )
-    if content.with_best:
-        notes += " The best evaluation is the highest of many, so the score of that team is too high on average."
+        notes += _OF_FINAL if content.is_final else _OF_BEST
     return f"{_table(rows)}\n\n{notes}"
+
+
+def _row_name(score: RunScore, is_final: bool) -> str:
+    which = "Best" if score.file == BEST_MODEL else "Last"
+    if is_final:
+        return f"{which} team, of {score.joint_steps:,} joint steps (`{score.file}`)"
+    return f"{which} evaluation, at {score.joint_steps:,} joint steps" + (f" (`{score.file}`)" if which == "Best" else "")
+
+
+def _origin(content: CardContent) -> str:
+    first = content.scores[0]
+    if not content.is_final:
+        return f"Means over {first.n_episodes} episodes of greedy play on seeds that the training did not use."
+    if not first.deterministic:
+        return f"Means over the last {first.n_episodes} episodes of the training, with sampled actions."
+    return (
+        f"Means over the {first.n_episodes} final episodes of a study: greedy play after the training, on seeds that neither"
+        " it nor its evaluations used."
+    )
 
 
 def _table(rows: dict[str, str]) -> str:

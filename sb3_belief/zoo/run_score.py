@@ -7,6 +7,7 @@ import numpy as np
 
 from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.run_folder import BEST_MODEL, TEAM
 
 #: Share of repetitions in which an interval is to contain the mean
 LEVEL = 0.95
@@ -35,13 +36,15 @@ class MeanWithInterval:
 @dataclass(frozen=True)
 class RunScore:
     """
-    Result of an evaluation during a run's training.
+    Result of an evaluation of a run's team.
 
     :param joint_steps: Number of joint steps trained until then
     :param n_episodes: Number of its episodes
     :param returns: Mean return, with a bootstrap interval over the episodes
     :param spread: Standard deviation of the returns
     :param success: Share of episodes that succeeded, with Wilson's interval; None if the environment reports none
+    :param file: Saved team that it tells of
+    :param deterministic: Whether it acted greedily
     """
 
     joint_steps: int
@@ -49,6 +52,8 @@ class RunScore:
     returns: MeanWithInterval
     spread: float
     success: MeanWithInterval | None = None
+    file: str = TEAM
+    deterministic: bool = True
 
 
 def run_scores(run: Path) -> tuple[RunScore, RunScore] | None:
@@ -66,12 +71,28 @@ def run_scores(run: Path) -> tuple[RunScore, RunScore] | None:
     if evaluations is None:
         return None
 
-    def score(row: int) -> RunScore:
-        returns, successes = evaluations.returns[row], evaluations.successes
-        won = None if successes is None or np.isnan(successes[row]).any() else _share(successes[row])
-        return RunScore(int(evaluations.steps[row]), len(returns), mean_of_episodes(returns), float(returns.std()), won)
+    def score(row: int, file: str) -> RunScore:
+        successes = None if evaluations.successes is None else evaluations.successes[row]
+        return score_of_episodes(int(evaluations.steps[row]), evaluations.returns[row], successes, file)
 
-    return score(-1), score(evaluations.best)
+    return score(-1, TEAM), score(evaluations.best, BEST_MODEL)
+
+
+def score_of_episodes(
+    joint_steps: int, returns: np.ndarray, successes: np.ndarray | None, file: str = TEAM, deterministic: bool = True
+) -> RunScore:
+    """
+    Return the score of an evaluation.
+
+    :param joint_steps: Number of joint steps trained until then
+    :param returns: The return of each episode, float ``[k]``
+    :param successes: Whether each succeeded, ``[k]``; None, or with a NaN, if that was not reported
+    :param file: Saved team that played them
+    :param deterministic: Whether it acted greedily
+    :return: The score
+    """
+    success = None if successes is None or np.isnan(successes).any() else _share(successes)
+    return RunScore(joint_steps, len(returns), mean_of_episodes(returns), float(returns.std()), success, file, deterministic)
 
 
 def mean_of_episodes(values: np.ndarray) -> MeanWithInterval:

@@ -125,6 +125,89 @@ def test_a_card_says_what_the_team_is(run, hub):
         assert said in text
 
 
+@pytest.fixture
+def cell(run, tmp_path):
+    """A finished cell of a study with that run, and the final episodes of its two teams."""
+    pa = pytest.importorskip("pyarrow", reason="final episodes are read with pyarrow")
+    from sb3_belief.report.episodes import EPISODES, write_episodes_table
+
+    folder = tmp_path / "study" / "cells" / "ppo" / "traffic-junction-easy" / "seed_3"
+    copy = folder / "ppo" / run.name
+    shutil.copytree(run, copy)
+    entries = {"study": "s", "arm": "ppo", "algo": "ppo", "env": "traffic-junction-easy", "seed": 3, "attempts": 1}
+    entries |= {"n_timesteps": 160, "final_episodes": 4, "options": {}, "settings": {}, "status": "finished"}
+    (folder / "cell.json").write_text(json.dumps(entries))
+    common = {"study": "s", "arm": "ppo", "algorithm": "ppo", "environment": "traffic-junction-easy", "seed": 3}
+    rows = []
+    for checkpoint, deterministic, level in (
+        ("last", True, 10.0),
+        ("last", False, 20.0),
+        ("best", True, 30.0),
+        ("best", False, 40),
+    ):
+        kind = {"phase": "final", "checkpoint": checkpoint, "deterministic": deterministic, "joint_steps": 80}
+        scores = [{"episode": i, "episode_return": level + i, "success": float(i > 0), "length": 5} for i in range(4)]
+        rows += [{**common, **kind, **each} for each in scores]
+    write_episodes_table(pa.Table.from_pylist(rows, schema=EPISODES), folder / "episodes.parquet")
+    return folder, copy
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_score_of_a_study_s_run_is_that_of_its_final_episodes(cell, hub, which):
+    assert main(["push", str(cell[which]), REPO]) == 0
+    assert hub.repos[REPO]["team.zip"] == (cell[1] / "team.zip").read_bytes()
+    data, text = card_of(hub)
+    metrics = {each["type"]: each for each in data["model-index"][0]["results"][0]["metrics"]}
+    assert metrics["mean_reward"]["value"] == "31.50 +/- 1.12" and metrics["success_rate"]["value"] == 0.75
+    arguments = metrics["mean_reward"]["args"]
+    assert (arguments["episodes"], arguments["deterministic"], arguments["team"]) == (4, True, "best_model.zip")
+    assert "| Best team, of 80 joint steps (`best_model.zip`) | 31.5 [30.5, 32.5] | 0.75 " in text
+    assert "| Last team, of 80 joint steps (`team.zip`) | 11.5 [" in text
+    assert (
+        "the 4 final episodes of a study" in text and "not too high for that reason" in text and "highest of many" not in text
+    )
+
+
+def test_the_evaluations_count_where_a_cell_has_no_final_episodes(cell, hub, capsys):
+    folder, copy = cell
+    record = json.loads((folder / "cell.json").read_text())
+    (folder / "cell.json").write_text(json.dumps({**record, "status": "failed"}))
+    assert main(["push", str(folder), REPO]) == 0
+    assert "| Last evaluation, at " in card_of(hub)[1]
+    (folder / "cell.json").write_text(json.dumps(record))
+    # A later run of the cell is the one whose episodes these are
+    shutil.copytree(copy, copy.with_name("traffic-junction-easy_7"))
+    assert main(["push", str(copy), REPO]) == 0
+    assert "| Last evaluation, at " in card_of(hub)[1]
+    half = (folder / "episodes.parquet").read_bytes()[:100]
+    (folder / "episodes.parquet").write_bytes(half)
+    capsys.readouterr()
+    assert main(["push", str(folder), REPO]) == 2
+    error = capsys.readouterr().err
+    assert "push: " in error and "episodes.parquet: is damaged" in error
+    shutil.rmtree(folder / "ppo")
+    assert main(["push", str(folder), REPO]) == 2
+    assert "is the folder of a cell whose run has not begun: sb3-belief study runs it." in capsys.readouterr().err
+
+
+def test_the_last_episodes_of_a_training_count_where_nothing_else_was_played(cell, hub):
+    import pyarrow.parquet as pq
+
+    from sb3_belief.report.episodes import write_episodes_table
+
+    folder, _ = cell
+    table = pq.read_table(folder / "episodes.parquet")
+    rows = [row for row in table.to_pylist() if row["checkpoint"] == "last" and not row["deterministic"]]
+    write_episodes_table(
+        table.from_pylist([{**row, "success": None} for row in rows], table.schema), folder / "episodes.parquet"
+    )
+    assert main(["push", str(folder), REPO]) == 0
+    data, text = card_of(hub)
+    (metric,) = data["model-index"][0]["results"][0]["metrics"]
+    assert metric["value"] == "21.50 +/- 1.12" and metric["args"]["deterministic"] is False
+    assert "the last 4 episodes of the training, with sampled actions" in text
+
+
 @pytest.mark.slow
 def test_the_program_of_a_card_works(run, hub, tmp_path):
     env = environment(hub, tmp_path)
