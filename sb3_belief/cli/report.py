@@ -4,7 +4,7 @@ import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path
 
-HELP = "write a page that compares the runs of a study or folder"
+HELP = "write a page that compares the runs of a study or folder, or shows a tuning"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -13,7 +13,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
     :param parser: Parser of the command
     """
-    parser.add_argument("source", type=filled_text, metavar="STUDY|LOGS", help="folder of a study, or one with runs")
+    parser.add_argument(
+        "source", type=filled_text, metavar="STUDY|TUNING|LOGS", help="folder of a study or tuning, or one with runs"
+    )
     parser.add_argument(
         "-o",
         "--output",

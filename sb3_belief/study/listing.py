@@ -1,6 +1,7 @@
 """The list of runs in a folder."""
 
 import os
+import sys
 import time
 from datetime import datetime
 from pathlib import Path
@@ -14,6 +15,7 @@ from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.report.learning_curve import read_episodes
 from sb3_belief.study.groups import LENGTH, labels
 from sb3_belief.study.run_reading import DAMAGED, RunData, read_run, run_folders
+from sb3_belief.study.tuning_folder import tuning_folders
 from sb3_belief.zoo.errors import ConfigError, short
 
 _COLUMNS = ("run", "algorithm", "environment", "seed", "status", "joint steps", "last score", "age")
@@ -32,6 +34,8 @@ def print_runs(folder: str) -> None:
         raise ConfigError(f"runs: no folder {short(folder)}: give one with runs, such as that of train -f (default: logs).")
     runs = [read_run(path) for path in run_folders(Path(folder))]
     rows = [_row(run, label, Path(folder)) for run, label in zip(runs, labels(runs, ignored=LENGTH), strict=True)]
+    for tuning in tuning_folders(Path(folder)):
+        print(f"The trials of the tuning {tuning} are not listed here: sb3-belief runs {tuning} does.", file=sys.stderr)
     console = Console()
     if not console.is_terminal:
         for row in (_COLUMNS, *rows):

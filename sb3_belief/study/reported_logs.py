@@ -7,12 +7,16 @@ from typing import Any
 
 import pyarrow as pa
 
+from sb3_belief.envs.suites import comma_separated
 from sb3_belief.report.episodes import EPISODES
 from sb3_belief.report.evaluations import EVALUATIONS, read_evaluations
 from sb3_belief.study.groups import labels
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.run_reading import RunData, read_run, run_folders
+from sb3_belief.study.tuning_folder import tuning_folders
 from sb3_belief.zoo.errors import ConfigError, short
+
+_GIVE = "give the folder of a study or a tuning, or one with runs"
 
 
 def reported_logs(folder: Path) -> Reported:
@@ -27,8 +31,14 @@ def reported_logs(folder: Path) -> Reported:
     :raises ConfigError: If there is no run
     """
     data = [read_run(path) for path in run_folders(folder)]
+    tunings = [short(str(path)) for path in tuning_folders(folder)]
     if not data:
-        raise ConfigError(f"{short(str(folder))}: holds no run and no study: give the folder of a study, or one with runs.")
+        what = (
+            f"only tunings: give one of them: {comma_separated(tunings, most=5)}"
+            if tunings
+            else f"no run and no study: {_GIVE}"
+        )
+        raise ConfigError(f"{short(str(folder))}: holds {what}.")
     names = labels(data, deciding=[run for run in data if not _why_not(run)])
     runs = [ReportedRun(each, label, why_not=_why_not(each)) for each, label in zip(data, names, strict=True)]
     rows: list[dict[str, Any]] = []
@@ -58,6 +68,8 @@ def reported_logs(folder: Path) -> Reported:
         table=pa.Table.from_pylist(rows, schema=EPISODES),
         evaluation_every=_common(counted, "eval_freq"),
         evaluation_episodes=_common(counted, "eval_episodes"),
+        notices=[f"The trials of tunings are not compared here; each tuning has a report: {', '.join(tunings)}."]
+        * bool(tunings),
     )
 
 

@@ -1,4 +1,4 @@
-"""The report of a study or of a folder of runs: a page, a page for each run, and all figures and tables as files."""
+"""The report of a study, a tuning or a folder of runs: a page, a page for each run, and all figures and tables as files."""
 
 import os
 import time
@@ -21,11 +21,15 @@ from sb3_belief.report.study_page.run_page import run_page
 from sb3_belief.report.study_page.runs import run_names
 from sb3_belief.report.study_page.sections import StudyPage
 from sb3_belief.report.study_page.text import result_sentences
+from sb3_belief.report.tuning_page.page import tuning_page
+from sb3_belief.report.tuning_page.text import outcome_sentences
 from sb3_belief.study.cell_record import EPISODES_FILE
 from sb3_belief.study.reported import Reported, ReportedRun
 from sb3_belief.study.reported_logs import reported_logs
 from sb3_belief.study.reported_study import is_study, reported_study
+from sb3_belief.study.reported_tuning import reported_tuning
 from sb3_belief.study.run_reading import diagnostic_series, evaluation_series
+from sb3_belief.study.tuning_folder import is_tuning
 from sb3_belief.zoo.errors import ConfigError, reason_of, short, unknown_setting
 from sb3_belief.zoo.run_folder import VIEWER
 
@@ -37,7 +41,7 @@ class ReportOptions:
     """
     Options of a report.
 
-    :param source: Folder of a study, or of runs
+    :param source: Folder of a study, of a tuning, or of runs
     :param output: HTML file to write. None for ``report.html`` in that folder
     :param quantity: ``"return"`` or ``"success"``. None for successes if all environments report them
     :param baseline: The arm that the others are compared with. None for that of the study, or ``ippo``
@@ -51,7 +55,7 @@ class ReportOptions:
 
 def write_report(options: ReportOptions) -> tuple[Path, str]:
     """
-    Write the report of a study, or of the runs in a folder.
+    Write the report of a study, of a tuning, or of the runs in a folder.
 
     :param options: The options
     :return: The page, and what was found, in a few sentences
@@ -59,11 +63,15 @@ def write_report(options: ReportOptions) -> tuple[Path, str]:
     """
     source = Path(options.source)
     if not os.path.isdir(source):
-        raise ConfigError(f"report: no folder {short(options.source)}: give the folder of a study, or one with runs.")
+        raise ConfigError(
+            f"report: no folder {short(options.source)}: give the folder of a study or a tuning, or one with runs."
+        )
     output = source / "report.html" if options.output is None else Path(options.output)
     if output.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"-o: {short(str(output))} must end in .html.")
     check_drawing()
+    if is_tuning(source) and not is_study(source):
+        return output, _write_tuning(options, output)
     reported = reported_study(source) if is_study(source) else reported_logs(source)
     baseline = _baseline(reported, options.baseline)
     try:
@@ -84,6 +92,26 @@ def write_report(options: ReportOptions) -> tuple[Path, str]:
     except OSError as error:
         raise ConfigError(f"-o: cannot write {short(str(output))} ({reason_of(error)}).") from None
     return output, result_sentences(findings)
+
+
+def _write_tuning(options: ReportOptions, output: Path) -> str:
+    """Write the report of a tuning, and return what was found."""
+    for flag, given in (("--quantity", options.quantity), ("--baseline", options.baseline)):
+        if given is not None:
+            raise ConfigError(
+                f"{flag}: {short(options.source)} is a tuning, which has one objective and compares no algorithms: leave"
+                f" {flag} out."
+            )
+    facts = reported_tuning(Path(options.source))
+    try:
+        write_page(tuning_page(facts, _made()), output, vega_bundle())
+    except OSError as error:
+        raise ConfigError(f"-o: cannot write {short(str(output))} ({reason_of(error)}).") from None
+    return outcome_sentences(facts)
+
+
+def _made() -> str:
+    return f"Made {time.strftime('%Y-%m-%d %H:%M %z')} by sb3-belief {__version__}."
 
 
 def _baseline(reported: Reported, given: str | None) -> str | None:
@@ -144,8 +172,7 @@ def _run_facts(run: ReportedRun, source: Path, quantity: str, scores: Mapping[in
 
 
 def _write(facts: StudyFacts, findings: Findings, output: Path) -> None:
-    made = f"Made {time.strftime('%Y-%m-%d %H:%M %z')} by sb3-belief {__version__}."
-    files = files_folder(output)
+    made, files = _made(), files_folder(output)
     bundle = vega_bundle()
     runs = files / RUNS
     with replaced_file(files / BUNDLE, "w", encoding="utf-8") as file:

@@ -15,6 +15,7 @@ import yaml
 from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.report.learning_curve import read_episodes, smooth
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, Series
+from sb3_belief.study.tuning_folder import is_tuning
 from sb3_belief.zoo.run_folder import CONFIG, RECORD
 from sb3_belief.zoo.run_lock import LOCK
 
@@ -71,12 +72,16 @@ class RunData:
 
 def run_folders(folder: Path) -> Iterator[Path]:
     """
-    Iterate over the folders of runs in a folder, at any depth.
+    Iterate over the folders of runs in a folder, at any depth, without the runs of tunings: each has settings of its own, and
+    is too short to be compared with others.
 
-    :param folder: The folder, which may be that of a run itself
+    :param folder: The folder, which may be that of a run itself, or of a tuning, whose runs are meant then
     :return: The folders, in the order of their paths
     """
     for path, folders, files in os.walk(folder):
+        if path != str(folder) and is_tuning(Path(path)):
+            folders.clear()
+            continue
         # What was being written when the record was damaged or lost is still a run
         if RECORD in files or (CONFIG in files and "monitor.csv" in files):
             folders.clear()

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 TABLE, BEST = "trials.csv", "best.yml"
 #: Columns of the table before those of the searched settings, which are named ``search/<setting>``
 COLUMNS = ("trial", "state", "objective", "value", "seed_values", "evaluations", "repeats", "started", "seconds", "error")
+#: What stands before the names of these
+SEARCHED = "search/"
+#: How a trial can be
+STATES = ("complete", "pruned", "failed", "killed", "running", "waiting")
 _STATES = {"COMPLETE": "complete", "PRUNED": "pruned", "RUNNING": "running", "WAITING": "waiting"}
 
 
@@ -34,7 +38,7 @@ def write_trials(folder: Path, spec: TuningSpec, trials: "Sequence[FrozenTrial]"
     space = spec.space
     with replaced_file(folder / TABLE, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*COLUMNS, *(f"search/{name}" for name in space)])
+        writer.writerow([*COLUMNS, *(f"{SEARCHED}{name}" for name in space)])
         for each in trials:
             attributes = each.user_attrs
             failed = "killed" if attributes.get("killed") else "failed"
@@ -51,7 +55,7 @@ def write_trials(folder: Path, spec: TuningSpec, trials: "Sequence[FrozenTrial]"
                     "" if each.datetime_start is None else each.datetime_start.isoformat(timespec="seconds"),
                     attributes.get("seconds", ""),
                     attributes.get("error", ""),
-                    *(_text(space[name].setting(drawn[name])) if name in drawn else "" for name in space),
+                    *(setting_cell(space[name].setting(drawn[name])) if name in drawn else "" for name in space),
                 ]
             )
 
@@ -98,5 +102,11 @@ def write_best(folder: Path, spec: TuningSpec, trials: "Sequence[FrozenTrial]", 
         file.write("".join(f"# {line}\n" for line in lines) + section)
 
 
-def _text(value: Any) -> str:
+def setting_cell(value: Any) -> str:
+    """
+    Return a setting as the table has it.
+
+    :param value: The setting
+    :return: A text as it is, and anything else as JSON
+    """
     return value if isinstance(value, str) else json.dumps(value)

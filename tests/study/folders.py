@@ -1,5 +1,6 @@
 """Folders of studies and of runs, written without any training."""
 
+import csv
 import json
 
 import numpy as np
@@ -120,3 +121,68 @@ def write_cell(folder, arm, algo, env, seed, chance, n_evaluations, episodes, fi
 def write_cell_record(cell, **record):
     cell.mkdir(parents=True, exist_ok=True)
     (cell / "cell.json").write_text(json.dumps({"attempts": 1, "error": None, "seconds": 30.0, "cpu_seconds": 28.0, **record}))
+
+
+SEARCH = {
+    "learning_rate": {"low": 1e-4, "high": 1e-2, "log": True, "schedule": "linear"},
+    "n_epochs": {"low": 2, "high": 10},
+    "gamma": {"low": 0.5, "high": 1.0},
+    "belief": {"choices": ["dynamic", "static"]},
+    "policy_kwargs.net_arch": {"choices": [[8], [16, 16]]},
+}
+
+
+def write_tuning(folder, n_trials=12, n_seeds=2, n_evaluations=4, **keys):
+    """
+    Write the folder of a tuning as ``sb3-belief tune`` does.
+
+    Trial 3 is pruned, 5 failed, 6 was killed and is repeated by 7, and the last one is running. The best one is 4.
+    """
+    rng = np.random.default_rng(0)
+    folder.mkdir(parents=True)
+    specification = {
+        "name": folder.name,
+        "algo": "belief_ppo",
+        "env": "junction",
+        "n_timesteps": 1000 * n_evaluations,
+        "n_trials": max(n_trials - 1, 1),
+        "seeds": list(range(1000, 1000 + n_seeds)),
+        "last_evaluations": 2,
+        "evaluation": {"every": 1000, "episodes": 8, "copies": 2},
+        "search": SEARCH,
+        **keys,
+    }
+    (folder / "tune.yml").write_text(yaml.safe_dump(specification, sort_keys=False))
+    names = ["trial", "state", "objective", "value", "seed_values", "evaluations", "repeats", "started", "seconds", "error"]
+    with open(folder / "trials.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*names, *(f"search/{name}" for name in SEARCH)], lineterminator="\n")
+        writer.writeheader()
+        for number in range(n_trials):
+            state = {3: "pruned", 5: "failed", 6: "killed", n_trials - 1: "running"}.get(number, "complete")
+            row = {
+                "trial": number,
+                "state": state,
+                "objective": "return",
+                "started": "2026-01-01T12:00:00",
+                "search/learning_rate": f"lin_{10 ** rng.uniform(-4, -2)!r}",
+                "search/n_epochs": int(rng.integers(2, 11)),
+                "search/gamma": float(rng.uniform(0.5, 1)),
+                "search/belief": ["dynamic", "static"][number % 2],
+                "search/policy_kwargs.net_arch": ["[8]", "[16, 16]"][number // 2 % 2],
+            }
+            rise = np.arange(1, n_evaluations + 1) * (2.0 if number == 4 else rng.uniform(0, 1))
+            runs = [rise + rng.normal(0, 0.1, n_evaluations) for _ in range(n_seeds)]
+            if state == "complete":
+                scores = [float(run[-2:].mean()) for run in runs]
+                row.update(value=float(np.mean(scores)), seed_values=json.dumps(scores), seconds=12.5 + number)
+                row.update(evaluations=json.dumps(np.concatenate(runs).tolist()), repeats=6 if number == 7 else "")
+            elif state == "pruned":
+                row.update(
+                    value=float(runs[0][1]), seed_values="[]", evaluations=json.dumps(runs[0][:2].tolist()), seconds=3.1
+                )
+            else:
+                row.update(seed_values="[]", evaluations="[]")
+                row["error"] = {"failed": "no memory </script> & <b>x</b>", "killed": "its process was killed"}.get(state, "")
+            writer.writerow(row)
+    (folder / "best.yml").write_text("# Settings of trial 4\njunction:\n  n_epochs: 3\n  learning_rate: lin_0.001\n")
+    return folder

@@ -164,7 +164,7 @@ def css_variables(colours: Mapping[str, str]) -> str:
 def _without_legends(value: Any) -> None:
     if isinstance(value, dict):
         for key, item in value.items():
-            if key in ("color", "strokeDash") and isinstance(item, dict) and "field" in item:
+            if key in ("color", "strokeDash", "shape") and isinstance(item, dict) and "field" in item:
                 item["legend"] = None
             _without_legends(item)
     elif isinstance(value, list):

@@ -13,7 +13,7 @@ NOTHING = "\u2013"
 # The sign, which is as wide as a digit
 _MINUS = "\u2212"
 
-Kind = Literal["text", "number", "count", "interval", "verdict", "link", "status"]
+Kind = Literal["text", "number", "significant", "count", "interval", "verdict", "link", "status"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Column:
     :param label: Its header on the page
     :param kind: How values are shown. An ``"interval"`` is a pair (low, high), which the CSV file has in two columns; a
         ``"link"`` a pair (text, relative address)
-    :param digits: Decimals of numbers
+    :param digits: Decimals of numbers, or significant digits of those that are ``"significant"``
     :param help: What the column means, shown when the pointer rests on the header
     :param shown: Whether the page has it. Otherwise only the CSV file does
     """
@@ -72,6 +72,8 @@ class Column:
             return f"{number_text(low, self.digits)} to {number_text(high, self.digits)}"
         if self.kind == "number":
             return number_text(value, self.digits)
+        if self.kind == "significant":
+            return f"{value:.{self.digits}g}".replace("-", _MINUS)
         if self.kind == "count":
             return f"{value:,}"
         return str(value[0]) if self.kind == "link" else str(value)
@@ -87,7 +89,7 @@ class Column:
             return None
         if self.kind == "interval":
             return float(value[0])
-        if self.kind in ("number", "count"):
+        if self.kind in ("number", "significant", "count"):
             return float(value)
         return self.text(value)
 
@@ -164,7 +166,7 @@ class Page:
     :param quote: How it was found, in a paragraph that can be copied
     :param notices: What the reader must know first, such as runs that failed
     :param sections: The sections
-    :param arms: Algorithms that the figures compare, with the colour of each (see ``figures.theme``)
+    :param arms: Algorithms, or other things, that the figures compare, with the colour of each (see ``figures.theme``)
     :param footer: Last line
     :param back: Relative address and text of the page above this one; None for none
     """

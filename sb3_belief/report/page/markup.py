@@ -42,6 +42,17 @@ def markup_of(*children: object) -> Html:
     return Html("".join(child if isinstance(child, Html) else _escaped(child) for child in children if child is not None))
 
 
+def copy_button(of: str, words: str) -> Html:
+    """
+    Return a button that copies the text of an element.
+
+    :param of: Id of the element
+    :param words: What the button says
+    :return: The button
+    """
+    return tag("button", words, type="button", class_="plain", data_copies=of)
+
+
 def json_script(identifier: str, value: Any) -> Html:
     """
     Return an element that holds data for the page's script.

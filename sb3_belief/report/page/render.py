@@ -8,10 +8,10 @@ from urllib.parse import quote
 from sb3_belief.report.figures.drawing import still_svg
 from sb3_belief.report.figures.theme import DARK, FONT, LIGHT, css_variables, on_page
 from sb3_belief.report.page.content import NOTHING, Column, Figure, Page, PageSection, Table
-from sb3_belief.report.page.markup import Html, json_script, markup_of, script_of, tag
+from sb3_belief.report.page.markup import Html, copy_button, json_script, markup_of, script_of, tag
 
 _STATIC = Path(__file__).parent / "static"
-_NUMBERS = ("number", "count", "interval")
+_NUMBERS = ("number", "significant", "count", "interval")
 # Colours of a page that no figure has
 _PAGE_LIGHT = {"--accent": "#1f6f8b", "--good": "#1e7a46", "--bad": "#b3372a", "--warn": "#8f5f00"}
 _PAGE_DARK = {"--accent": "#6fc3df", "--good": "#63c78d", "--bad": "#f28b7d", "--warn": "#e3b347"}
@@ -104,7 +104,7 @@ def _header(page: Page) -> Html:
     parts += [tag("p", paragraph, class_="lead") for paragraph in page.lead.split("\n")]
     if page.quote:
         parts.append(tag("p", page.quote, class_="quote", id="quote"))
-        parts.append(tag("p", tag("button", "Copy this paragraph", type="button", id="copy", class_="plain")))
+        parts.append(tag("p", copy_button("quote", "Copy this paragraph")))
     return tag("header", *parts)
 
 
@@ -125,7 +125,7 @@ def _section(section: PageSection, page: Page, files: str | None) -> Html:
 def _figures(figures: Sequence[Figure], page: Page, files: str | None) -> Iterator[Html]:
     shown = [arm for arm in page.arms if any(_holds(figure.spec, arm) for figure in figures)]
     if len(shown) > 1:
-        yield tag("ul", *(tag("li", _legend_button(arm, page)) for arm in shown), class_="legend", aria_label="Algorithms")
+        yield tag("ul", *(tag("li", _legend_button(arm, page)) for arm in shown), class_="legend", aria_label="Legend")
     beside = {1: " one", 2: " two", 4: " two"}.get(len(figures), "")
     yield tag("div", *(_figure(figure, files) for figure in figures), class_=f"figures{beside}")
 

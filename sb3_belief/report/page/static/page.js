@@ -18,19 +18,21 @@
   name();
   document.getElementById("print")?.addEventListener("click", () => print());
 
-  // ---- the paragraph to quote ----------------------------------------------------------------------------------
-  const copy = document.getElementById("copy");
-  copy?.addEventListener("click", async () => {
-    const quote = document.getElementById("quote");
-    try {
-      await navigator.clipboard.writeText(quote.textContent);
-      copy.textContent = "Copied";
-    } catch (error) {
-      getSelection().selectAllChildren(quote);
-      copy.textContent = "Selected: copy it with Ctrl-C";
-    }
-    setTimeout(() => { copy.textContent = "Copy this paragraph"; }, 2500);
-  });
+  // ---- texts to copy -------------------------------------------------------------------------------------------
+  for (const copy of all("[data-copies]")) {
+    const words = copy.textContent;
+    copy.addEventListener("click", async () => {
+      const source = document.getElementById(copy.dataset.copies);
+      try {
+        await navigator.clipboard.writeText(source.textContent);
+        copy.textContent = "Copied";
+      } catch (error) {
+        getSelection().selectAllChildren(source);
+        copy.textContent = "Selected: copy it with Ctrl-C";
+      }
+      setTimeout(() => { copy.textContent = words; }, 2500);
+    });
+  }
 
   // ---- tables --------------------------------------------------------------------------------------------------
   const collator = new Intl.Collator(undefined, { numeric: true });

@@ -1,0 +1,1 @@
+"""The page of a tuning: what was searched, the best settings, and all trials."""
