@@ -190,7 +190,8 @@ class Storage:
             chosen = optuna.samplers.RandomSampler(seed=seed)
         prunes: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
         if pruner["name"] == "median":
-            prunes = optuna.pruners.MedianPruner(pruner["startup_trials"], pruner["warmup_evaluations"])
+            # Evaluations count from 1, and at the number of warm-up steps itself Optuna does prune
+            prunes = optuna.pruners.MedianPruner(pruner["startup_trials"], pruner["warmup_evaluations"] + 1)
         return optuna.create_study(
             study_name=self._spec.name,
             storage=self._storage,

@@ -93,6 +93,23 @@ def test_the_best_settings_train(undisturbed, tmp_path):
     assert train_main([*words, "-conf", str(undisturbed / "best.yml"), "-f", str(tmp_path)]) == 0
 
 
+def test_a_report_reads_what_was_written(undisturbed):
+    from sb3_belief.study.reported_tuning import reported_tuning
+    from sb3_belief.study.tuning_folder import is_tuning
+
+    facts = reported_tuning(undisturbed)
+    assert is_tuning(undisturbed) and len(facts.trials) == facts.n_trials == 4
+    for row, trial in zip(rows_of(undisturbed), facts.trials, strict=True):
+        assert (trial.state, trial.value, trial.seconds) == (row["state"], float(row["value"]), float(row["seconds"]))
+        assert trial.settings == {
+            "learning_rate": float(row["search/learning_rate"].removeprefix("lin_")),
+            "policy_kwargs.net_arch": row["search/policy_kwargs.net_arch"],
+            "n_epochs": int(row["search/n_epochs"]),
+        }
+    assert facts.best is not None and f"# Settings of trial {facts.best.number} of the tuning" in facts.best_settings
+    assert facts.specification == (undisturbed / "tune.yml").read_text()
+
+
 def test_a_finished_tuning_is_not_repeated_and_can_be_extended(undisturbed, tmp_path, capsys):
     folder = tmp_path / "out" / "tiny"
     shutil.copytree(undisturbed, folder)
@@ -176,6 +193,30 @@ def test_a_trial_is_begun_three_times_at_most(tmp_path):
     assert drawn[0] == drawn[1] == drawn[2]
     states = [each.state.name for each in storage.trials()]
     assert states == ["FAIL"] * 3 and "as in 2 tries before" in storage.trials()[-1].user_attrs["error"]
+
+
+@pytest.mark.parametrize(("warmup", "pruned"), [(0, [True, True, True]), (1, [False, True, True]), (2, [False, False, True])])
+def test_no_trial_is_pruned_at_a_warm_up_evaluation(tmp_path, warmup, pruned):
+    from sb3_belief.study.tune import begin
+    from sb3_belief.study.tuning_spec import load_tuning
+    from sb3_belief.study.tuning_storage import Storage
+
+    pruner = {"startup_trials": 1, "warmup_evaluations": warmup}
+    spec = load_tuning(written(tmp_path, **{**FAST, "pruner": pruner}))
+    begin(spec, tmp_path / "out")
+    storage = Storage(tmp_path / "out", spec)
+    first = storage.draw()
+    assert first is not None
+    for step in (1, 2, 3):
+        first.report(5.0, step)
+    storage.finish(first, 5.0, [5.0], 1.0)
+    second = storage.draw()
+    assert second is not None
+    found = []
+    for step in (1, 2, 3):
+        second.report(0.0, step)
+        found.append(second.should_prune())
+    assert found == pruned
 
 
 def test_what_fails_whatever_is_drawn_stops_the_tuning(tmp_path, capsys):
