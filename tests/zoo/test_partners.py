@@ -2,13 +2,14 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 from sb3_belief.cli.main import main, train_main
-from sb3_belief.team import make_team_env
+from sb3_belief.team import TeamVecEnv, make_team_env
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError
@@ -29,8 +30,13 @@ def drive(obs):
     return 0
 
 
+def agents_space(env: TeamVecEnv, agent: str) -> Any:
+    observed: Any = env.observation_space
+    return observed[agent]
+
+
 def plain_observer(obs):
-    assert make_team_env(EASY).observation_space["car_1"].contains(obs)
+    assert agents_space(make_team_env(EASY), "car_1").contains(obs)
     return 0
 
 
@@ -100,10 +106,10 @@ def test_learners_observe_their_last_step_and_partners_do_not(tmp_path, capsys):
     run = tmp_path / "logs" / "recurrent_ppo" / f"{EASY}_1"
     config = load_config("recurrent_ppo", EASY, str(run / "config.yml"), extra_packages=("tests",))
     env = make_env(config, 3, 0)
-    plain = make_team_env(EASY).observation_space["car_0"]
+    plain = agents_space(make_team_env(EASY), "car_0")
     assert env.possible_agents == ["car_0"] and env.unwrapped is env
     # Of each of the four others two actions and whether it was seen, of its own two, and the reward
-    assert env.observation_space["car_0"]["observation"].shape == (plain.shape[0] + 4 * 3 + 2 + 1,)
+    assert agents_space(env, "car_0")["observation"].shape == (plain.shape[0] + 4 * 3 + 2 + 1,)
     env.reset()
     before, changes = env.get_attr("partner"), []
     for _ in range(20 * 4):
