@@ -135,7 +135,7 @@ class SettingsChecker:
         if key == "policy" and value not in self.policies:
             raise unknown_setting(location.text, "policy", value, self.policies)
         if key == "policy_kwargs" and self.policy_class is not None:
-            return self._check_policy_kwargs(value, location)
+            return self._check_policy_kwargs(self.policy_class, value, location)
         if key == "normalize" and isinstance(value, dict):
             return check_call(VecNormalize, value, location, skip=1)
         if key in ("env_kwargs", "eval_env_kwargs"):
@@ -155,8 +155,8 @@ class SettingsChecker:
             return callbacks
         return value
 
-    def _check_policy_kwargs(self, value: Any, location: Location) -> dict[str, Any]:
-        checked = check_call(self.policy_class, value, location, reserved=self.policy_reserved)
+    def _check_policy_kwargs(self, policy_class: type, value: Any, location: Location) -> dict[str, Any]:
+        checked = check_call(policy_class, value, location, reserved=self.policy_reserved)
         networks = checked.get("net_arch")
         # SB3 makes no network of a name that it does not know, and says nothing
         names = ("pi", "vf" if issubclass(self.algo_class, OnPolicyAlgorithm) else "qf")
