@@ -1,7 +1,7 @@
 """Agents that observe while they are evaluated: what they see goes into their histories, and no weight changes."""
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
-from sb3_belief.team.arguments import check_team_vec_env
+from sb3_belief.team.arguments import check_agent_keys, check_team_vec_env
 from sb3_belief.team.team import Team
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts
@@ -39,7 +39,9 @@ class ObservingVecEnv(VecEnvWrapper):
 
     def __init__(self, venv: VecEnv, policies: Mapping[str, BeliefPolicyMixin], most_steps: int | None):
         super().__init__(venv)
-        self._policies, self._most_steps = policies, most_steps
+        self._policies = policies
+        #: How many steps each agent observes at most, which may be raised as it goes on; None without a limit
+        self.most_steps = most_steps
         #: How many steps each agent has observed: those in which it was in play, of all copies together
         self.steps = dict.fromkeys(policies, 0)
         #: Whether steps are observed; set to False to go on without
@@ -82,8 +84,8 @@ class ObservingVecEnv(VecEnvWrapper):
 
     def _remember(self, agent: str, seen: _Seen) -> None:
         rows = np.flatnonzero(seen.active)
-        if self._most_steps is not None:
-            rows = rows[: self._most_steps - self.steps[agent]]
+        if self.most_steps is not None:
+            rows = rows[: self.most_steps - self.steps[agent]]
         if len(rows):
             self._policies[agent].remember(map_parts(lambda part: part[rows], seen.obs), seen.others_actions[rows])
             self.steps[agent] += len(rows)
@@ -122,7 +124,9 @@ class _ObservingLearner(ObservingVecEnv):
 
 
 @contextmanager
-def observing(model: Any, env: VecEnv, most_steps: int | None = None) -> Iterator[ObservingVecEnv]:
+def observing(
+    model: Any, env: VecEnv, most_steps: int | None = None, agents: Collection[str] | None = None
+) -> Iterator[ObservingVecEnv]:
     """
     Let agents observe while they act in an environment, as they do when they are deployed::
 
@@ -138,6 +142,7 @@ def observing(model: Any, env: VecEnv, most_steps: int | None = None) -> Iterato
         agent. For a single model with all wrappers of its observations, such as ``VecNormalize``
     :param most_steps: How many steps each agent observes at most, at least 0: exactly as many, if as many are played. None
         without a limit
+    :param agents: Names of a team's agents that observe; None for all
     :return: The environment to evaluate in. Its ``steps`` says how many steps each agent has observed; those of a single
         model have the name of the learner. While its ``is_open`` is set to False, nothing is observed
     :raises TypeError: If ``model`` is neither a team nor a model, or the environment is not one of a team
@@ -150,7 +155,9 @@ def observing(model: Any, env: VecEnv, most_steps: int | None = None) -> Iterato
         team_env: Any = check_team_vec_env(env).unwrapped
         if team_env.possible_agents != model.possible_agents:
             raise ValueError(f"The team has the agents {model.possible_agents}, the environment {team_env.possible_agents}.")
-        models = dict(model.agents)
+        if agents is not None:
+            check_agent_keys("agents", dict.fromkeys(agents), model.possible_agents)
+        models = {agent: each for agent, each in model.agents.items() if agents is None or agent in agents}
     elif isinstance(model, BaseAlgorithm):
         if isinstance(env.unwrapped, TeamVecEnv):
             raise TypeError("A single model observes in a vectorised AgentEnv; this is the environment of a team.")

@@ -231,3 +231,19 @@ def test_refused():
             pass
     with observing(team, env) as watched, pytest.raises(RuntimeError, match="has to be reset"):
         watched.step({agent: np.zeros(2, dtype=int) for agent in team.agents})
+
+
+def test_some_agents_observe_and_for_longer_as_it_goes_on():
+    env = make_team_env(ToyEnv, n_envs=2, seed=0)
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **BELIEF)
+    others = [agent for agent in team.agents if agent != "agent_0"]
+    before = {agent: team.agents[agent].policy.history for agent in team.agents}
+    with observing(team, env, most_steps=1, agents=["agent_0"]) as watched:
+        watched.reset()
+        for most, counted in ((1, 1), (4, 3), (4, 4)):
+            watched.most_steps = most
+            watched.step({agent: np.zeros(2, dtype=int) for agent in team.agents})
+            assert watched.steps == {"agent_0": counted}
+        assert all(team.agents[agent].policy.history.actions is before[agent].actions for agent in others)
+    with pytest.raises(ValueError, match=r"unknown agents .*nobody"), observing(team, env, agents=["nobody"]):
+        pass
