@@ -57,6 +57,7 @@ class ShownEnvironment:
     :param frame_rate: Frames per second
     :param observation: Further arguments of it: what agents observe besides
     :param partners: The agents that are not of the team; None if all are
+    :param visibility: Argument of ``make_team_env``: what agents see of the others is what they observe, and remember
     """
 
     env_id: str
@@ -65,6 +66,7 @@ class ShownEnvironment:
     frame_rate: int = 10
     observation: dict[str, Any] = field(default_factory=dict)
     partners: PartnersConfig | None = None
+    visibility: Callable[[Any], Any] | None = None
 
 
 def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironment:
@@ -95,7 +97,12 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     config = load_config(algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder)
     partners = config.partners if saved.partners is None else _given_partners(path, saved)
     return ShownEnvironment(
-        config.env_id, config.env_kwargs, config.wrapper, observation=config.observation, partners=partners
+        config.env_id,
+        config.env_kwargs,
+        config.wrapper,
+        observation=config.observation,
+        partners=partners,
+        visibility=config.visibility,
     )
 
 
@@ -141,6 +148,51 @@ def with_mode(shown: ShownEnvironment, mode: str) -> ShownEnvironment:
     return replace(shown, env_kwargs={**shown.env_kwargs, "render_mode": mode})
 
 
+def make_shown_env(shown: ShownEnvironment, saved: ShownTeam, n_envs: int, seed: int, command: str) -> TeamVecEnv:
+    """
+    Make the environment of a replay, with its partners in it.
+
+    :param shown: The environment
+    :param saved: The options
+    :param n_envs: Number of copies
+    :param seed: Its seed
+    :param command: Name of the command, for error messages
+    :return: The environment, seeded and not reset yet
+    :raises ConfigError: If it refuses its settings
+    """
+    with _refusals_as_config_errors(shown, command):
+        env = make_team_env(
+            shown.env_id,
+            n_envs=n_envs,
+            seed=seed,
+            env_kwargs=shown.env_kwargs,
+            wrapper=shown.wrapper,
+            visibility=shown.visibility,
+        )
+        if shown.partners is not None:
+            env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
+        return with_last_step(env, **shown.observation)
+
+
+def load_into(path: Path, env: TeamVecEnv, saved: ShownTeam, command: str) -> Team:
+    """
+    Load a team into an environment, which is then seeded as in the training.
+
+    :param path: Zip of the team
+    :param env: The environment
+    :param saved: The options
+    :param command: Name of the command, for error messages
+    :return: The team
+    :raises ConfigError: If it cannot be loaded, or the environment does not fit
+    """
+    try:
+        trust = Trust.of(saved.trust, saved.extra_packages)
+        return Team.load(path, env=env, device=saved.device, **trust._asdict())
+    # A damaged file makes zipfile, pickle and torch raise whatever they raise
+    except Exception as error:
+        raise ConfigError(f"{command}: {str(path)!r} cannot be loaded: {cause(error)}") from error
+
+
 @contextmanager
 def team_in_its_environment(
     path: Path, shown: ShownEnvironment, saved: ShownTeam, seed: int, command: str
@@ -156,18 +208,9 @@ def team_in_its_environment(
     :return: The team and the environment, seeded and not reset yet
     :raises ConfigError: If the environment refuses its settings, or the team cannot be loaded
     """
-    with _refusals_as_config_errors(shown, command):
-        env = make_team_env(shown.env_id, seed=seed, env_kwargs=shown.env_kwargs, wrapper=shown.wrapper)
-        if shown.partners is not None:
-            env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
-        env = with_last_step(env, **shown.observation)
+    env = make_shown_env(shown, saved, 1, seed, command)
     try:
-        try:
-            trust = Trust.of(saved.trust, saved.extra_packages)
-            team = Team.load(path, env=env, device=saved.device, **trust._asdict())
-        # A damaged file makes zipfile, pickle and torch raise whatever they raise
-        except Exception as error:
-            raise ConfigError(f"{command}: {str(path)!r} cannot be loaded: {cause(error)}") from error
+        team = load_into(path, env, saved, command)
         # This comes after loading, which seeds the environment as in the training
         env.seed(seed)
         # What the agents sample, and what an environment draws from the global generators, is then the same again
