@@ -10,7 +10,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sb3_belief.cli import demo, enjoy, envs, export, load, plot, push, report, runs, study, train, tune, watch
+from sb3_belief.cli import (
+    adapt,
+    demo,
+    enjoy,
+    envs,
+    export,
+    load,
+    plot,
+    push,
+    report,
+    runs,
+    study,
+    train,
+    tune,
+    watch,
+)
 from sb3_belief.cli.flags import STYLE, Parser
 from sb3_belief.zoo.errors import ConfigError, RunFailed
 
@@ -36,6 +51,7 @@ COMMANDS = {
     "watch": watch,
     "runs": runs,
     "plot": plot,
+    "adapt": adapt,
     "study": study,
     "report": report,
     "tune": tune,

@@ -99,7 +99,8 @@ def env_seed(seed: int, purpose: int = 0, step: int | None = None) -> int:
 
     :param seed: The team's seed
     :param purpose: 0 for training, 1 for an environment of evaluations that is to have other episodes, 2 for episodes that
-        begin with a checkpoint, 3 for the final evaluations of a study
+        begin with a checkpoint, 3 for the final evaluations of a study, 4 for episodes that agents observe to adapt, 5 for
+        those that are evaluated then
     :param step: The joint step at which the environment is seeded, for one that is seeded again; None before the first
     :return: The environment's seed, in [0, 2**30)
     """

@@ -3,7 +3,7 @@
 import os
 import time
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, TypeAlias
 
@@ -41,6 +41,14 @@ class JointObs(dict[str, Any]):
     def __deepcopy__(self, memo: dict[int, Any]) -> "JointObs":
         # SB3's VecTransposeImage copies the observations; the infos need not be
         return JointObs(deepcopy(dict(self), memo), self._agents, self._infos)
+
+    def of(self, agents: Iterable[str]) -> "JointObs":
+        """
+        Return the observations of some agents, which know as much of lives that have ended.
+
+        :param agents: Their names
+        """
+        return JointObs({agent: self[agent] for agent in agents}, self._agents, self._infos)
 
     def life_ends(self, agent: str) -> np.ndarray | None:
         """
