@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from sb3_belief.cli import (
     adapt,
+    crossplay,
     demo,
     enjoy,
     envs,
@@ -52,6 +53,7 @@ COMMANDS = {
     "runs": runs,
     "plot": plot,
     "adapt": adapt,
+    "crossplay": crossplay,
     "study": study,
     "report": report,
     "tune": tune,
