@@ -15,6 +15,7 @@ from sb3_belief.report.figures.drawing import check_drawing, vega_bundle
 from sb3_belief.report.page.content import Page
 from sb3_belief.report.page.files import files_folder, write_page
 from sb3_belief.report.page.render import render_page
+from sb3_belief.report.study_page.adapting import adapting_sections
 from sb3_belief.report.study_page.facts import RunFacts, StudyFacts
 from sb3_belief.report.study_page.findings import Findings, default_quantity, findings_of
 from sb3_belief.report.study_page.run_page import run_page
@@ -88,7 +89,7 @@ def write_report(options: ReportOptions) -> tuple[Path, str]:
     try:
         if reported.is_study and reported.table.num_rows:
             write_episodes_table(reported.table, source / EPISODES_FILE)
-        _write(facts, findings, output)
+        _write(facts, findings, source, output)
     except OSError as error:
         raise ConfigError(f"-o: cannot write {short(str(output))} ({reason_of(error)}).") from None
     return output, result_sentences(findings)
@@ -171,7 +172,7 @@ def _run_facts(run: ReportedRun, source: Path, quantity: str, scores: Mapping[in
     )
 
 
-def _write(facts: StudyFacts, findings: Findings, output: Path) -> None:
+def _write(facts: StudyFacts, findings: Findings, source: Path, output: Path) -> None:
     made, files = _made(), files_folder(output)
     bundle = vega_bundle()
     runs = files / RUNS
@@ -183,7 +184,8 @@ def _write(facts: StudyFacts, findings: Findings, output: Path) -> None:
         viewer = None if run.viewer is None else os.path.relpath(run.viewer, runs.resolve())
         _write_run_page(run_page(run, findings.unit, (f"../../{output.name}", facts.name), made, viewer), path)
         pages[str(run.folder)] = f"{files.name}/{RUNS}/{path.name}"
-    write_page(StudyPage(facts, findings, made, pages).page(), output, bundle)
+    page = StudyPage(facts, findings, made, pages, adapting_sections(source)).page()
+    write_page(page, output, bundle)
 
 
 def _write_run_page(page: Page, path: Path) -> None:

@@ -1,6 +1,6 @@
 """The page of a study."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,10 +34,18 @@ class StudyPage:
     :param findings: What was found
     :param made: When the page was made, and by which version, in words
     :param run_pages: {folder of a run: relative address of its page}
+    :param measures: Sections of further measures, see ``study_page.adapting``
     """
 
-    def __init__(self, facts: StudyFacts, findings: Findings, made: str, run_pages: Mapping[str, str]) -> None:
-        self.facts, self.findings, self.made, self.run_pages = facts, findings, made, run_pages
+    def __init__(
+        self,
+        facts: StudyFacts,
+        findings: Findings,
+        made: str,
+        run_pages: Mapping[str, str],
+        measures: Sequence[PageSection] = (),
+    ) -> None:
+        self.facts, self.findings, self.made, self.run_pages, self.measures = facts, findings, made, run_pages, measures
         self.colours = arm_colours(findings.arms, findings.baseline)
         self.dashes = arm_dashes(findings.arms, findings.baseline)
         # Those of the two tables that other functions make
@@ -55,6 +63,7 @@ class StudyPage:
             self._profiles(),
             *self._ablations(),
             *self._diagnostics(),
+            *self.measures,
             runs_section(self.facts, self.findings.unit, self.run_pages),
             terms_section(self.facts),
         ]
