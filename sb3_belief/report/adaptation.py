@@ -250,8 +250,8 @@ def adaptation_sentences(rows: Sequence[Row]) -> str:
     if first.skill is not None and last.skill is not None:
         said.append(f"Its predictions are {_text(first.skill)}, then {_text(last.skill)} above the base rate.")
     regrets = [(point.regret.value, point.partner) for point in partners if point.regret is not None]
-    if regrets:
-        worst, partner = max(regrets)
+    worst, partner = max(regrets, default=(0.0, ""))
+    if worst > 0:
         said.append(f"The largest regret after {last.steps} steps is {worst:.3g}, beside {partner}.")
     return " ".join(said)
 
