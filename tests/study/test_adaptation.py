@@ -133,6 +133,30 @@ def test_each_agent_in_turn_unless_one_is_named(teams, tmp_path):
     assert [row["agent"] for row in rows_of(tmp_path)] == agents
 
 
+def test_partners_act_for_those_whom_a_team_has_no_models_for(teams, tmp_path):
+    env = make_team_env(EASY, n_envs=2, seed=0)
+    rest = [agent for agent in env.possible_agents if agent != "car_0"]
+    met = dict.fromkeys(rest, str(teams["b"]))
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, device="cpu", partners=met, **TINY).learn(16)
+    team.save(tmp_path / "one.zip")
+    pool = tmp_path / "pool.yml"
+    still = "sb3_belief.envs.traffic_junction.nobody:brake"
+    pool.write_text(yaml.safe_dump({"members": {"a": str(teams["a"]), "b": dict.fromkeys(rest, str(teams["b"]))}}))
+    options = options_of(teams, tmp_path, run=str(tmp_path / "one.zip"), pool=str(pool), agent=None)
+    adapt(options)
+    rows = rows_of(tmp_path)
+    assert {(row["partner"], row["type"], row["agent"]) for row in rows} == {("a", "a", ""), ("b", "b", "")}
+    by_name = {name: [row["return"] for row in rows if row["partner"] == name] for name in "ab"}
+    assert by_name["a"] != by_name["b"]
+    with pytest.raises(ConfigError, match="--agent: all agents of the team learn beside these partners"):
+        adapt(replace(options, agent="car_0"))
+    pool.write_text(yaml.safe_dump({"members": {"still": still}}))
+    with pytest.raises(ConfigError, match="still: no module"):
+        adapt(options)
+    with pytest.raises(ConfigError, match="nobody acts for"):
+        adapt(replace(options, pool="level:easy"))
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
