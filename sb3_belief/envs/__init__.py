@@ -1,6 +1,7 @@
 """Environments: a registry of ids, the PettingZoo environments of this package, and adapters to those of other packages."""
 
 from sb3_belief.envs.adapters.pettingzoo import to_parallel
+from sb3_belief.envs.aisle_sides import AisleSides
 from sb3_belief.envs.env_checker import check_team_env
 from sb3_belief.envs.registry import EnvSpec, make_batched_env, make_parallel_env, register, registered_ids, spec
 from sb3_belief.envs.suites import SUITES, Suite
@@ -13,6 +14,7 @@ FAMILIES, Family = SUITES, Suite
 __all__ = [
     "FAMILIES",
     "SUITES",
+    "AisleSides",
     "EnvSpec",
     "Family",
     "Suite",

@@ -137,6 +137,18 @@ _SPECS |= {
     }.items()
 }
 
+_AISLE_SIDES = "sb3_belief.envs.aisle_sides"
+
+_SPECS |= {
+    env_id: EnvSpec(
+        id=env_id,
+        parallel=f"{_AISLE_SIDES}.parallel_env:AisleSides",
+        kwargs={"kinds": kinds},
+        batched=f"{_AISLE_SIDES}.vec_env:AisleSidesVecEnv",
+    )
+    for env_id, kinds in (("aisle-sides", 1), ("aisle-sides-kinds", 4))
+}
+
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """
