@@ -20,6 +20,7 @@ Parts:
 - ``checkpoints``: learning with the checkpoints that a run has by default, against without (benchmarks/checkpoints.py)
 - ``partners``: one learner among nine partners: a pool of saved teams against one, and functions of batches against the
   callables of an ``AgentEnv`` (benchmarks/partners.py)
+- ``scripted``: one learner among nine scripted cars in one batch, against nine callables (benchmarks/scripted.py)
 - ``gpu``: updates on a GPU against the CPU, where there is a GPU
 
 torch uses one thread. Speeds are joint steps (of one copy) per second of CPU time, including that of workers, and per second
@@ -33,7 +34,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory, partners
+from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory, partners, scripted
 from benchmarks.measure import Loop, Sample, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
@@ -113,6 +114,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "finite": finite.run,
     "checkpoints": checkpoints.run,
     "partners": partners.run,
+    "scripted": scripted.run,
     "gpu": gpu.run,
 }
 

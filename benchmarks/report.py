@@ -28,6 +28,7 @@ BARS: dict[str, tuple[str, float]] = {
     "checks_sac": ("<=", 1.02),
     "checks_ppo": ("<=", 1.02),
     "checkpoints_vs_none": (">=", 0.97),
+    "scripted_vs_callables": (">=", 10.0),
     "seconds_of_a_checkpoint": ("<", 0.5),
     "pool_vs_one_team": (">=", 0.5),
     "pool_per_copy_vs_one_team": (">=", 0.5),

@@ -20,7 +20,10 @@ AGENT_STEPS = 32
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
     out = tmp_path_factory.mktemp("bench") / "out" / "bench.json"
     bench.main(
-        ["--quick", "--parts", "a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "partners", "--out", str(out)]
+        [
+            *("--quick", "--out", str(out), "--parts"),
+            *("a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "partners", "scripted"),
+        ]
     )
     return json.loads(Path(out).read_text())
 

@@ -3,6 +3,7 @@
 from sb3_belief.envs.adapters.pettingzoo import to_parallel
 from sb3_belief.envs.aisle_sides import AisleSides
 from sb3_belief.envs.env_checker import check_team_env
+from sb3_belief.envs.junction_cultures import JunctionCultures
 from sb3_belief.envs.registry import EnvSpec, make_batched_env, make_parallel_env, register, registered_ids, spec
 from sb3_belief.envs.suites import SUITES, Suite
 from sb3_belief.envs.switching_convention import SwitchingConvention
@@ -17,6 +18,7 @@ __all__ = [
     "AisleSides",
     "EnvSpec",
     "Family",
+    "JunctionCultures",
     "Suite",
     "SwitchingConvention",
     "TrafficJunction",

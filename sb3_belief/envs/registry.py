@@ -149,6 +149,22 @@ _SPECS |= {
     for env_id, kinds in (("aisle-sides", 1), ("aisle-sides-kinds", 4))
 }
 
+_JUNCTION_CULTURES = "sb3_belief.envs.junction_cultures"
+
+_SPECS |= {
+    f"junction-cultures-{name}": EnvSpec(
+        id=f"junction-cultures-{name}",
+        parallel=f"{_JUNCTION_CULTURES}.parallel_env:JunctionCultures",
+        kwargs=kwargs,
+        batched=f"{_JUNCTION_CULTURES}.vec_env:JunctionCulturesVecEnv",
+    )
+    for name, kwargs in {
+        "easy": {"level": "easy"},
+        "medium": {"level": "medium"},
+        "orders": {"level": "medium", "cultures": "orders"},
+    }.items()
+}
+
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """

@@ -31,7 +31,9 @@ from tests.team.toy_envs import ToyEnv
 def test_all_ids_make_what_they_say():
     levels = ["traffic-junction-easy", "traffic-junction-medium", "traffic-junction-hard"]
     games = ["convention-swap", "convention-watch-act", "convention-redraw"]
-    assert registered_ids() == levels + games + ["aisle-sides", "aisle-sides-kinds"]
+    aisles = ["aisle-sides", "aisle-sides-kinds"]
+    cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
+    assert registered_ids() == levels + games + aisles + cultures
     for env_id in games:
         # The arguments behind the ids are tested with the environment
         env, batched = make_parallel_env(env_id), make_batched_env(env_id, 3)

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_belief.envs.aisle_sides.config import MIDDLE, RIGHT, AisleConfig, convention_names
 from sb3_belief.envs.aisle_sides.core import AisleCore, observation_width
-from sb3_belief.envs.aisle_sides.rendering import draw_aisles, positions_in_picture
+from sb3_belief.envs.aisle_sides.rendering import draw_aisles, robot_positions
 from sb3_belief.envs.base import ResetResult, StepResult, TeamGame, check_render_mode, require_render_mode
 
 ACTION_NAMES = ("middle", "left", "right")
@@ -110,7 +110,7 @@ class AisleSides(TeamGame[np.ndarray, int]):
         self.core = AisleCore(1, self.config)
         self.possible_agents, others = robot_names(self.config)
         self.agents: list[str] = []
-        self.observation_spaces = {agent: observation_space(self.config) for agent in self.possible_agents}
+        self.observation_spaces = {agent: aisle_observation_space(self.config) for agent in self.possible_agents}
         self.action_spaces = {agent: spaces.Discrete(len(ACTION_NAMES)) for agent in self.possible_agents}
         self.scripted_action_spaces: dict[str, spaces.Space] = {other: spaces.Discrete(len(ACTION_NAMES)) for other in others}
 
@@ -189,7 +189,7 @@ class AisleSides(TeamGame[np.ndarray, int]):
 
         :return: {agent: (x, y)}, as fractions of its width and height, from the upper left corner
         """
-        return positions_in_picture(self.core, 0, self.possible_agents)
+        return robot_positions(self.core, 0, self.possible_agents)
 
     def get_state(self) -> dict[str, Any]:
         """
@@ -232,7 +232,7 @@ def robot_names(config: AisleConfig) -> tuple[list[str], list[str]]:
     return [f"robot_{i}" for i in numbers], [f"other_{i}" for i in numbers]
 
 
-def observation_space(config: AisleConfig) -> spaces.Box:
+def aisle_observation_space(config: AisleConfig) -> spaces.Box:
     """
     Return a new observation space.
 

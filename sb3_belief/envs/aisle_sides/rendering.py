@@ -49,7 +49,7 @@ def draw_aisles(core: AisleCore, copy: int) -> np.ndarray:
     return picture.image()
 
 
-def positions_in_picture(core: AisleCore, copy: int, agents: Sequence[str]) -> dict[str, tuple[float, float]]:
+def robot_positions(core: AisleCore, copy: int, agents: Sequence[str]) -> dict[str, tuple[float, float]]:
     """
     Return where the learners are in the picture of a copy.
 

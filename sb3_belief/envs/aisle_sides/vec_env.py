@@ -8,8 +8,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.envs.aisle_sides.config import MIDDLE, RIGHT, AisleConfig, convention_names
 from sb3_belief.envs.aisle_sides.core import AisleCore
-from sb3_belief.envs.aisle_sides.parallel_env import ACTION_NAMES, observation_space, robot_names, visible_others
-from sb3_belief.envs.aisle_sides.rendering import draw_aisles, positions_in_picture
+from sb3_belief.envs.aisle_sides.parallel_env import ACTION_NAMES, aisle_observation_space, robot_names, visible_others
+from sb3_belief.envs.aisle_sides.rendering import draw_aisles, robot_positions
 from sb3_belief.envs.base import check_render_mode
 from sb3_belief.envs.batched_vec_env import BatchedVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
@@ -40,7 +40,7 @@ class AisleSidesVecEnv(BatchedVecEnv):
         super().__init__(
             num_envs,
             agents,
-            {agent: observation_space(self.config) for agent in agents},
+            {agent: aisle_observation_space(self.config) for agent in agents},
             {agent: spaces.Discrete(len(ACTION_NAMES)) for agent in agents},
             render_mode=check_render_mode(render_mode, ("rgb_array",)),
             scripted_action_spaces={other: spaces.Discrete(len(ACTION_NAMES)) for other in others},
@@ -101,7 +101,7 @@ class AisleSidesVecEnv(BatchedVecEnv):
 
         :return: {agent: (x, y)}
         """
-        return positions_in_picture(self.core, 0, self.possible_agents)
+        return robot_positions(self.core, 0, self.possible_agents)
 
     @property
     def batched_game(self) -> AisleCore:
