@@ -1,5 +1,7 @@
 """Cultures: what scripted cars do by them, in scenes that are set by hand, and what hand rules of the learner bring."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from sb3_belief.envs.junction_cultures.policies import Yields, evaluate_culture_
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS
 from tests.envs.traffic_junction.scenarios import BOTTOM, EAST, STRAIGHT, TOP, WEST, put
 
-EACH = {"redraw_unit": "episodes", "per_copy": True, "redraw_every": 1}
+EACH: dict[str, Any] = {"redraw_unit": "episodes", "per_copy": True, "redraw_every": 1}
 
 
 def scene(culture, **kwargs):

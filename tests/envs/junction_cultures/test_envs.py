@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from sb3_belief.envs import JunctionCultures, TrafficJunction, check_team_env, make_batched_env, make_parallel_env
@@ -64,7 +63,7 @@ def test_a_batch_equals_single_copies_bit_for_bit(kwargs):
             assert dones[i] == truncations["car_0"] and not terminations["car_0"]
             n_lives += info["life_end"][0]
             np.testing.assert_array_equal(info["visible"], [single.visibility()["car_0"]])
-            scripted = [spaces.flatten(spaces.Discrete(2), did) for did in single.scripted_actions().values()]
+            scripted = [np.eye(2)[did] for did in single.scripted_actions().values()]
             np.testing.assert_array_equal(info["scripted_actions"], np.concatenate(scripted))
             mask = own_infos["car_0"]["action_mask"]
             if dones[i]:
