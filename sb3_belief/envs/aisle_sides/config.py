@@ -49,11 +49,6 @@ class AisleConfig(TypeRules):
             raise ValueError(f"held_out=True needs kinds >= 3, since fewer have no held-out conventions; kinds={self.kinds}.")
 
     @property
-    def n_conventions(self) -> int:
-        """The number of conventions, 2 to the power of ``kinds``."""
-        return 2**self.kinds
-
-    @property
     def weights(self) -> tuple[float, ...]:
         """The weight of each convention in the draws, 1 or 0."""
         held_out = held_out_conventions(self.kinds)

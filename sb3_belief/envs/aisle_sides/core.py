@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.envs.aisle_sides.config import MIDDLE, AisleConfig, convention_sides
+from sb3_belief.envs.aisle_sides.config import LEFT, MIDDLE, RIGHT, AisleConfig, convention_sides
 from sb3_belief.envs.drawn_types import DrawnTypes
 
 NOBODY = -1
@@ -147,7 +147,8 @@ class AisleCore:
         obs[robots, copies, 1 + self.gap[copies, robots]] = 1.0
         obs[robots, copies, 2 + rules.sight + self.kind[copies, robots]] = 1.0
         if rules.reveal_partner:
-            obs[:, self._copy, 2 + rules.sight + rules.kinds + self.types.current] = 1.0
+            told = self.sides[self.types.current][:, :, None] == np.array([LEFT, RIGHT])
+            obs[:, :, 2 + rules.sight + rules.kinds :] = told.reshape(self.n_copies, -1)
         return obs
 
     def get_state(self, copy: int) -> dict[str, Any]:
@@ -194,7 +195,7 @@ def observation_width(config: AisleConfig) -> int:
     :param config: The rules
     :return: 2 for the robot itself, and the distance, kind and, if it is told, convention of the others
     """
-    return 2 + config.sight + config.kinds + (config.n_conventions if config.reveal_partner else 0)
+    return 2 + config.sight + config.kinds + (2 * config.kinds if config.reveal_partner else 0)
 
 
 _STATE_ARRAYS = ("position", "other", "kind", "jam", "action", "other_action", "saw", "time", "draws")

@@ -62,8 +62,8 @@ class KnowConvention:
         return {agent: self._sides_of(values) for agent, values in obs.items()}
 
     def _sides_of(self, obs: np.ndarray) -> np.ndarray:
-        told = obs[:, -self.config.n_conventions :].argmax(axis=1)
-        return convention_sides(self.config.kinds)[told, _kinds_of(obs, self.config)]
+        told = obs[:, -2 * self.config.kinds :].reshape(len(obs), self.config.kinds, 2)
+        return told[np.arange(len(obs)), _kinds_of(obs, self.config)].argmax(axis=1) + LEFT
 
 
 class Remember:
@@ -86,7 +86,7 @@ class Remember:
         if span != "copy" and (self.config.per_copy or self.config.redraw_unit != "rollouts"):
             raise ValueError(f"span={span!r} pools the copies, which needs per_copy=False and redraw_unit='rollouts'.")
         self._sides = convention_sides(self.config.kinds)
-        self._compatible = self._new = np.zeros((0, self.config.n_conventions))
+        self._compatible = self._new = np.zeros((0, len(self.config.weights)))
         self._age = self._episodes = np.zeros(0, dtype=np.int64)
 
     def __call__(self, obs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
