@@ -20,7 +20,7 @@ class TypeRules:
     :param rollout_steps: Steps of one copy in a rollout, >= 1: the learner's ``n_steps``. It counts with rollouts only
     :param partner_seed: Seed of the draws, >= 0
     :param held_out: Whether types are drawn from those that are held out of training, instead of the others
-    :param reveal_partner: Whether observations end with the present type, one-hot
+    :param reveal_partner: Whether observations end with what the present type is, one-hot
     :raises ValueError: For any other value, and for episodes without ``per_copy``
     """
 

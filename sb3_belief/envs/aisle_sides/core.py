@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.envs.aisle_sides.config import LEFT, MIDDLE, RIGHT, AisleConfig, convention_sides
+from sb3_belief.envs.aisle_sides.config import LEFT, MIDDLE, AisleConfig, convention_sides
 from sb3_belief.envs.drawn_types import DrawnTypes
 
 NOBODY = -1
@@ -147,8 +147,8 @@ class AisleCore:
         obs[robots, copies, 1 + self.gap[copies, robots]] = 1.0
         obs[robots, copies, 2 + rules.sight + self.kind[copies, robots]] = 1.0
         if rules.reveal_partner:
-            told = self.sides[self.types.current][:, :, None] == np.array([LEFT, RIGHT])
-            obs[:, :, 2 + rules.sight + rules.kinds :] = told.reshape(self.n_copies, -1)
+            side = self.sides[self.types.current[copies], self.kind[copies, robots]]
+            obs[robots, copies, 2 + rules.sight + rules.kinds + side - LEFT] = 1.0
         return obs
 
     def get_state(self, copy: int) -> dict[str, Any]:
@@ -193,9 +193,9 @@ def observation_width(config: AisleConfig) -> int:
     Return the number of entries of an observation.
 
     :param config: The rules
-    :return: 2 for the robot itself, and the distance, kind and, if it is told, convention of the others
+    :return: 2 for the robot itself, and the distance, kind and, if it is told, side of the one in sight
     """
-    return 2 + config.sight + config.kinds + (2 * config.kinds if config.reveal_partner else 0)
+    return 2 + config.sight + config.kinds + (2 if config.reveal_partner else 0)
 
 
 _STATE_ARRAYS = ("position", "other", "kind", "jam", "action", "other_action", "saw", "time", "draws")

@@ -44,7 +44,7 @@ class AisleSides(TeamGame[np.ndarray, int]):
         1               steps until a jam dissolves / jam_steps, 0 without a jam
         2 ..            distance of the robot in sight in cells, one-hot (sight)
         2 + sight ..    its kind, one-hot (kinds)
-        ...             with reveal_partner: the side of each kind, left or right, one-hot (2 kinds)
+        ...             with reveal_partner: the side to which it keeps, left or right, one-hot (2)
 
     :param kinds: Number of visible kinds of robots, from 1 to 6
     :param n_robots: Number of learners, each in an aisle of its own, >= 1
@@ -60,8 +60,8 @@ class AisleSides(TeamGame[np.ndarray, int]):
     :param rollout_steps: Steps of one copy in a rollout, >= 1: the learner's ``n_steps``. It counts with rollouts only
     :param partner_seed: Seed of the sequence of conventions, >= 0. With ``per_copy`` the seed of ``reset`` is part of it
     :param held_out: Whether to draw from the conventions that are held out of training, instead of from the others
-    :param reveal_partner: Whether observations end with the present convention, as an upper bound of what can be known. It is
-        told kind by kind, so that it can be followed even if it has never been met
+    :param reveal_partner: Whether observations end with what the present convention says of the robot in sight, as an upper
+        bound of what can be known
     :param render_mode: None or ``"rgb_array"``
     :raises ValueError: For any other value, for episodes without ``per_copy``, and for ``held_out`` with fewer than 3 kinds
     """

@@ -95,7 +95,7 @@ def test_a_robot_enters_where_it_is_not_seen_yet(position, enters):
 def test_observations_part_by_part():
     core = scene(3, 5, convention=6, kind=2, kinds=3, reveal_partner=True)
     own, sight, kind = [3 / 7, 0], [0, 1, 0], [0, 0, 1]
-    told = [0, 1, 0, 1, 1, 0]
+    told = [1, 0]
     np.testing.assert_array_equal(core.observe()[0, 0], np.array(own + sight + kind + told, np.float32))
     # Convention 6 is RRL
     do(core, RIGHT)

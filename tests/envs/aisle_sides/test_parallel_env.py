@@ -57,7 +57,9 @@ def test_only_the_oracle_observes_the_convention():
     for seed, (name, seen) in found.items():
         same, told = observed(seed, reveal_partner=True)
         assert same == name and np.array_equal(told[:, :-2], seen)
-        assert (told[:, -2:] == {"left": [1, 0], "right": [0, 1]}[name]).all()
+        in_sight = seen[:, 2:5].any(axis=1)
+        assert in_sight.any() and (told[in_sight, -2:] == {"left": [1, 0], "right": [0, 1]}[name]).all()
+        assert not told[~in_sight, -2:].any()
 
 
 def play(env, n_steps):
