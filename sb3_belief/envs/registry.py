@@ -165,6 +165,12 @@ _SPECS |= {
     }.items()
 }
 
+_SPECS["convention-episode"] = EnvSpec(
+    id="convention-episode",
+    parallel=f"{_SWITCHING_CONVENTION}.episode_env:ConventionEpisode",
+    batched=f"{_SWITCHING_CONVENTION}.episode_env:ConventionEpisodeVecEnv",
+)
+
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """

@@ -33,7 +33,8 @@ def test_all_ids_make_what_they_say():
     games = ["convention-swap", "convention-watch-act", "convention-redraw"]
     aisles = ["aisle-sides", "aisle-sides-kinds"]
     cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
-    assert registered_ids() == levels + games + aisles + cultures
+    tasks = ["convention-episode"]
+    assert registered_ids() == levels + games + aisles + cultures + tasks
     for env_id in games:
         # The arguments behind the ids are tested with the environment
         env, batched = make_parallel_env(env_id), make_batched_env(env_id, 3)

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.common.redraws import RedrawSchedule
+
 REWARDED = ("always", "last")
 
 
@@ -20,13 +22,15 @@ class ConventionConfig:
     The rules of a switching convention.
 
     :param m: Number of cues and of actions, >= 2
-    :param K: Number of rollouts for which a convention is valid, >= 1. None if it never changes
+    :param K: Number of rollouts, or of episodes, for which a convention is valid, >= 1. None if it never changes
     :param rollout_steps: Steps of one copy in a rollout, >= 1. Also the length of an episode
     :param rewarded: In which of a convention's rollouts the follower is rewarded: ``"always"``, or ``"last"`` for the last
         one only
     :param leader_visible: Whether the follower can observe the leader's actions
     :param seed: Seed of the sequence of conventions, >= 0
-    :raises ValueError: For any other value
+    :param redraw_unit: What K counts: ``"rollouts"``, which pass with the steps, or ``"episodes"``, which pass with the resets
+    :param per_copy: Whether each copy has conventions of its own
+    :raises ValueError: For any other value, and for ``"episodes"`` without ``per_copy``
     """
 
     m: int = 4
@@ -35,6 +39,8 @@ class ConventionConfig:
     rewarded: str = "always"
     leader_visible: bool = True
     seed: int = 0
+    redraw_unit: str = "rollouts"
+    per_copy: bool = False
 
     def __post_init__(self) -> None:
         for name, value, least, meaning in (
@@ -59,28 +65,37 @@ class ConventionConfig:
             )
         if not isinstance(self.leader_visible, bool):
             raise ValueError(f"leader_visible={self.leader_visible!r} must be True or False.")
+        # Which checks the rest
+        _ = self.schedule
+
+    @property
+    def schedule(self) -> RedrawSchedule:
+        """How long a convention is valid, and for whom."""
+        return RedrawSchedule(self.K, self.redraw_unit, self.per_copy, self.seed)
 
 
-# Cached, because all copies need the same convention at the same time
-@lru_cache(maxsize=128)
-def convention(m: int, seed: int, number: int) -> np.ndarray:
+# Cached, because all copies need the same convention at the same time unless each has its own
+@lru_cache(maxsize=1024)
+def convention(m: int, seed: int, *key: int) -> np.ndarray:
     """
     Return one convention of a sequence.
 
     :param m: Number of cues
     :param seed: Seed of the sequence
-    :param number: Position in the sequence, from 0
+    :param key: Position in the sequence, from 0, and for a copy with conventions of its own the copy's seed
     :return: The leader's action at each cue, int64 [m], a permutation drawn uniformly. The array is read-only
     """
-    # A seed of its own for each position, so that any convention can be drawn without those before it
-    drawn = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).permutation(m)
+    # A seed of its own for each position, as RedrawSchedule has it. That one draws numbers of a list, and a list of all
+    # permutations would be long
+    drawn = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).permutation(m)
     drawn.flags.writeable = False
     return drawn
 
 
 class ConventionGame:
     """
-    ``n_copies`` independent followers that are stepped together, each with a leader that follows the same conventions.
+    ``n_copies`` independent followers that are stepped together, each with a leader that follows the same conventions, or
+    with ``per_copy`` conventions of its own.
 
     Each copy has a random generator of its own, and the cues of an episode are drawn at its start in one call. A copy with a
     given seed therefore behaves the same alone and in a batch.
@@ -96,14 +111,21 @@ class ConventionGame:
         # One cue more than there are steps, since there is an observation after the last step too
         self.cues = np.zeros((n_copies, config.rollout_steps + 1), dtype=np.int64)
         self.time = np.zeros(n_copies, dtype=np.int64)
-        # Steps since the copy was last seeded. Unlike time it is not reset with an episode, and it determines the convention
+        # Steps since the copy was last seeded. Unlike time it is not reset with an episode. With it, or with the number of the
+        # present episode since then (-1 before the first), the convention is determined
         self.age = np.zeros(n_copies, dtype=np.int64)
+        self.episode = np.full(n_copies, -1, dtype=np.int64)
+        # The seeds of copies with conventions of their own
+        self.copy_seeds = [_own_seed(None) for _ in range(n_copies)]
         self.leader = np.zeros(n_copies, dtype=np.int64)
         # The actions of the last step, for pictures only
         self.follower = self.leader
         self.conventions = np.zeros((n_copies, config.m), dtype=np.int64)
         self._copy = np.arange(n_copies)
-        self._convention_steps = None if config.K is None else config.K * config.rollout_steps
+        self._schedule, self._by_episodes = config.schedule, config.redraw_unit == "episodes"
+        # With episodes, conventions change at resets only
+        changes_with_steps = config.K is not None and not self._by_episodes
+        self._convention_steps = config.K * config.rollout_steps if changes_with_steps else None  # type: ignore[operator]
         self._update_conventions(self._copy)
 
     @property
@@ -121,17 +143,21 @@ class ConventionGame:
         :param seed: Seed of its cues, or None for one from the operating system
         """
         self.generators[copy] = np.random.default_rng(seed)
-        self.age[copy] = 0
+        self.copy_seeds[copy] = _own_seed(seed)
+        self.age[copy], self.episode[copy] = 0, -1
         self._update_conventions(np.array([copy]))
 
     def reset(self, copies: np.ndarray | None = None) -> None:
         """
-        Start new episodes. The conventions do not change.
+        Start new episodes. The conventions change only if they are valid for a number of episodes.
 
         :param copies: Indices of the copies to reset, int [k]. None for all
         """
         chosen = self._copy if copies is None else copies
         self.time[chosen] = 0
+        self.episode[chosen] += 1
+        if self._by_episodes:
+            self._update_conventions(chosen)
         for copy in chosen:
             self.cues[copy] = self.generators[copy].integers(self.config.m, size=self.cues.shape[1])
 
@@ -145,8 +171,8 @@ class ConventionGame:
         self.leader, self.follower = self.conventions[self._copy, self.cue], actions
         rewards = (actions == self.leader).astype(np.float32)
         if self.config.rewarded == "last":
-            # age // rollout_steps is the number of the rollout, and a convention is valid for K of them
-            rewards[self.age // self.config.rollout_steps % self.config.K != self.config.K - 1] = 0.0  # type: ignore[operator]
+            # A convention is valid for K rollouts or episodes
+            rewards[self._passed % self.config.K != self.config.K - 1] = 0.0  # type: ignore[operator]
         self.time += 1
         self.age += 1
         if self._convention_steps is not None:
@@ -155,10 +181,18 @@ class ConventionGame:
                 self._update_conventions(due)
         return rewards, self.time >= self.config.rollout_steps
 
+    @property
+    def _passed(self) -> np.ndarray:
+        """Rollouts or episodes that have ended since the copies were seeded, int64 [n_copies]."""
+        return np.maximum(self.episode, 0) if self._by_episodes else self.age // self.config.rollout_steps
+
     def _update_conventions(self, copies: np.ndarray) -> None:
+        passed = self._passed
         for copy in copies:
-            number = 0 if self._convention_steps is None else int(self.age[copy]) // self._convention_steps
-            self.conventions[copy] = convention(self.config.m, self.config.seed, number)
+            key = [self._schedule.number(int(passed[copy]))]
+            if self.config.per_copy:
+                key.append(self.copy_seeds[copy])
+            self.conventions[copy] = convention(self.config.m, self.config.seed, *key)
 
     def get_state(self, copy: int) -> dict[str, Any]:
         """
@@ -171,7 +205,7 @@ class ConventionGame:
             "config": asdict(self.config),
             "cues": self.cues[copy].copy(),
             "generator": self.generators[copy].bit_generator.state,
-            **{name: int(getattr(self, name)[copy]) for name in ("time", "age", "leader")},
+            **{name: int(getattr(self, name)[copy]) for name in ("time", "age", "leader", "episode", "copy_seeds")},
         }
 
     def set_state(self, copy: int, state: dict[str, Any]) -> None:
@@ -183,14 +217,20 @@ class ConventionGame:
         :raises ValueError: If the rules differ
         """
         rules = asdict(self.config)
-        if state["config"] != rules:
+        # A state that was saved before there were these rules lacks them, and the counts that they need
+        if {**asdict(ConventionConfig()), **state["config"]} != rules:
             raise ValueError(
                 f"The state is of an environment with {state['config']}, this one has {rules}: a state can only be restored in"
                 " an environment with the same arguments."
             )
         self.cues[copy] = state["cues"]
         self.generators[copy].bit_generator.state = state["generator"]
-        for name in ("time", "age", "leader"):
-            getattr(self, name)[copy] = state[name]
-        # The convention is not part of the state, since age determines it
+        for name in ("time", "age", "leader", "episode", "copy_seeds"):
+            getattr(self, name)[copy] = state.get(name, 0)
+        # The convention is not part of the state, since the rest determines it
         self._update_conventions(np.array([copy]))
+
+
+def _own_seed(seed: int | None) -> int:
+    """Return the seed of a copy's conventions; one that was seeded by nobody has one of the operating system."""
+    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed

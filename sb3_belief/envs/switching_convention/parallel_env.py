@@ -59,6 +59,8 @@ class SwitchingConvention(TeamGame[int, int]):
     :param seed: Seed of the sequence of conventions, >= 0. All copies made with the same seed have the same leader. The seed
         of ``reset`` determines the cues
     :param render_mode: None or ``"rgb_array"``
+    :param redraw_unit: ``"rollouts"``, or ``"episodes"`` for a convention that is valid for K episodes
+    :param per_copy: Whether each copy has conventions of its own, which depend on its seed too. ``"episodes"`` need it
     :raises ValueError: For any other value, and for ``rewarded="last"`` with ``K=None``
     """
 
@@ -77,9 +79,11 @@ class SwitchingConvention(TeamGame[int, int]):
         leader_visible: bool = True,
         seed: int = 0,
         render_mode: str | None = None,
+        redraw_unit: str = "rollouts",
+        per_copy: bool = False,
     ):
         self.render_mode = check_render_mode(render_mode, ("rgb_array",))
-        self.config = ConventionConfig(m, K, rollout_steps, rewarded, leader_visible, seed)
+        self.config = ConventionConfig(m, K, rollout_steps, rewarded, leader_visible, seed, redraw_unit, per_copy)
         self.game = ConventionGame(1, self.config)
         self.possible_agents = [FOLLOWER]
         self.agents: list[str] = []
@@ -98,8 +102,8 @@ class SwitchingConvention(TeamGame[int, int]):
         """
         Start an episode.
 
-        :param seed: Seed of the cues. The environment also starts again with its first convention. With None both the cues
-            and the convention continue
+        :param seed: Seed of the cues, and with ``per_copy`` of the conventions. The environment also starts again with its
+            first convention. With None both the cues and the conventions continue
         :param options: Not used
         :return: The first cue and an empty info, by agent
         """
@@ -107,7 +111,11 @@ class SwitchingConvention(TeamGame[int, int]):
             self.game.seed(0, seed)
         self.game.reset()
         self.agents = [FOLLOWER]
-        return {FOLLOWER: int(self.game.cue[0])}, {FOLLOWER: {}}
+        return {FOLLOWER: self._observe()}, {FOLLOWER: {}}
+
+    def _observe(self) -> Any:
+        """Return what the follower observes."""
+        return int(self.game.cue[0])
 
     def step(
         self, actions: dict[str, int]
@@ -130,7 +138,7 @@ class SwitchingConvention(TeamGame[int, int]):
         done = bool(dones[0])
         if done:
             self.agents = []
-        obs, reward = {FOLLOWER: int(self.game.cue[0])}, {FOLLOWER: float(rewards[0])}
+        obs, reward = {FOLLOWER: self._observe()}, {FOLLOWER: float(rewards[0])}
         return obs, reward, {FOLLOWER: done}, {FOLLOWER: False}, {FOLLOWER: {}}
 
     def scripted_actions(self) -> dict[str, int]:

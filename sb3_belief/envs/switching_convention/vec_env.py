@@ -75,16 +75,16 @@ class SwitchingConventionVecEnv(BatchedVecEnv):
             {"agent_rewards": reward, "life_end": self._ends[done], "scripted_actions": scripted, **self._always}
             for reward, done, scripted in zip(rewards[:, None], dones.tolist(), self._one_hot[self.game.leader], strict=True)
         ]
-        cues = self.game.cue
+        obs = self._observe()
         ended = np.flatnonzero(dones)
         if len(ended):
             for copy in ended:
                 infos[copy]["TimeLimit.truncated"] = False
-                infos[copy]["terminal_observation"] = {FOLLOWER: cues[copy]}
+                infos[copy]["terminal_observation"] = {FOLLOWER: obs[FOLLOWER][copy]}
             self.game.reset(ended)
-            cues = self.game.cue
+            obs = self._observe()
         # The follower is the only agent, so its reward is also the team's. A copy, so that the infos have arrays of their own
-        return {FOLLOWER: cues}, rewards.copy(), dones, infos
+        return obs, rewards.copy(), dones, infos
 
     def get_images(self) -> list[np.ndarray | None]:
         """
