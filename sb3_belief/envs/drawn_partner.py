@@ -32,7 +32,7 @@ class DrawnPartner:
 
     :param names: Names of the types, which are drawn with equal probability
     :param schedule: How long one stays
-    :param rollout_steps: Steps of one copy in a rollout, which is the learner's ``n_steps``; needed by a schedule of rollouts only
+    :param rollout_steps: Steps of one copy in a rollout, the learner's ``n_steps``; needed by a schedule of rollouts only
     :param reveal: Whether the learner is told the type
     :raises ValueError: If ``rollout_steps`` is no such number, or a schedule of rollouts lacks it
     """
@@ -44,8 +44,8 @@ class DrawnPartner:
         is_count = isinstance(rollout_steps, int) and not isinstance(rollout_steps, bool) and rollout_steps >= 1
         if not (is_count or (rollout_steps is None and not self._by_rollouts)):
             raise ValueError(
-                f"rollout_steps={rollout_steps!r} must be an integer >= 1, the learner's n_steps: with redraw_unit='rollouts' it"
-                " says how many steps of a copy are a rollout. Without rollouts it may be None."
+                f"rollout_steps={rollout_steps!r} must be an integer >= 1, the learner's n_steps: with redraw_unit='rollouts'"
+                " it says how many steps of a copy are a rollout. Without rollouts it may be None."
             )
         if not isinstance(reveal, bool):
             raise ValueError(f"reveal_partner={reveal!r} must be True or False.")

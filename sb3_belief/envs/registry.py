@@ -47,6 +47,8 @@ class EnvSpec:
         copies at once. None if the environment has no such class
     :param suite: Suite that the environment belongs to, or None if it needs no further package. The callables of a suite take
         the environment's name as their first argument
+    :param requires: Name of a suite whose package the environment needs, although it is none of the suite's. None if it needs
+        none
     """
 
     id: str
@@ -54,6 +56,7 @@ class EnvSpec:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     batched: str | None = None
     suite: Suite | None = None
+    requires: str | None = None
 
     def __post_init__(self) -> None:
         # The usual assignment is not possible in a frozen dataclass
@@ -79,6 +82,8 @@ class EnvSpec:
         """
         if self.suite is not None:
             self.suite.require(self.id)
+        if self.requires is not None:
+            SUITES[self.requires].require(self.id)
         if not isinstance(self.parallel, str):
             return self.parallel
         if self.parallel != self.id:
@@ -169,6 +174,9 @@ _SPECS["convention-episode"] = EnvSpec(
     id="convention-episode",
     parallel=f"{_SWITCHING_CONVENTION}.episode_env:ConventionEpisode",
     batched=f"{_SWITCHING_CONVENTION}.episode_env:ConventionEpisodeVecEnv",
+)
+_SPECS["foreign-speaker"] = EnvSpec(
+    id="foreign-speaker", parallel="sb3_belief.envs.foreign_speaker.parallel_env:ForeignSpeaker", requires="mpe"
 )
 
 

@@ -34,6 +34,7 @@ def test_all_ids_make_what_they_say():
     aisles = ["aisle-sides", "aisle-sides-kinds"]
     cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
     tasks = ["convention-episode"]
+    tasks = ["convention-episode", "foreign-speaker"]
     assert registered_ids() == levels + games + aisles + cultures + tasks
     for env_id in games:
         # The arguments behind the ids are tested with the environment
