@@ -179,6 +179,20 @@ _SPECS["foreign-speaker"] = EnvSpec(
     id="foreign-speaker", parallel="sb3_belief.envs.foreign_speaker.parallel_env:ForeignSpeaker", requires="mpe"
 )
 
+_FORAGING: dict[str, dict[str, Any]] = {
+    "picker": {"partners": "orders", "partner_sight": 2, "max_episode_steps": 20},
+    "lbf-heuristics": {
+        "game": "Foraging-8x8-2p-3f-v3",
+        "partners": "heuristics",
+        "partner_sight": None,
+        "max_episode_steps": 50,
+    },
+}
+_SPECS |= {
+    id: EnvSpec(id, "sb3_belief.envs.foraging_partners.parallel_env:PartneredForaging", kwargs, requires="lbf")
+    for id, kwargs in _FORAGING.items()
+}
+
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """

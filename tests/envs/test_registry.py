@@ -35,6 +35,7 @@ def test_all_ids_make_what_they_say():
     cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
     tasks = ["convention-episode"]
     tasks = ["convention-episode", "foreign-speaker"]
+    tasks = ["convention-episode", "foreign-speaker", "picker", "lbf-heuristics"]
     assert registered_ids() == levels + games + aisles + cultures + tasks
     for env_id in games:
         # The arguments behind the ids are tested with the environment

@@ -15,7 +15,8 @@ from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv
 IDS: list[Any] = [
     *("mpe/simple_spread_v3", "mpe/simple_tag_v3", "mpe/simple_speaker_listener_v4", "mpe/simple_world_comm_v3"),
     *("lbf/Foraging-2s-8x8-2p-2f-coop-v3", "rware/rware-tiny-2ag-v2", "pettingzoo/sisl.pursuit_v5"),
-    *("traffic-junction-easy", "convention-swap", "convention-redraw"),
+    *("traffic-junction-easy", "convention-swap", "convention-redraw", "convention-episode"),
+    *("foreign-speaker", "picker", "lbf-heuristics"),
     *(ToyEnv, MixedEnv, ScriptedEnv),
 ]
 

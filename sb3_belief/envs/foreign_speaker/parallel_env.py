@@ -28,16 +28,16 @@ class ForeignSpeaker(TeamGame[np.ndarray, int]):
     observation on. Its reward, -25 times the squared distance from the goal, comes at the end only, so that a position does
     not give the goal away while there is time left. An episode has 25 steps and terminates.
 
-    What a symbol means shows in the reward alone. A history of observations and of the speaker's actions says nothing of it, so
-    who is better than the blind policies without having kept its own rewards has found a leak. See
+    What a symbol means shows in the reward alone. A history of observations and of the speaker's actions says nothing of it,
+    so who is better than the blind policies without having kept its own rewards has found a leak. See
     :mod:`sb3_belief.envs.foreign_speaker.policies` for what policies without training reach.
 
     The observation is MPE's: float32 [11], own velocity 2, landmarks relative to oneself 2 each, what was heard as a one-hot
-    code of 3. Actions are nothing, left, right, down and up. Infos of the team hold ``partner``, the symbol for each landmark as
-    text (``"2-0-1"``).
+    code of 3. Actions are nothing, left, right, down and up. Infos of the team hold ``partner``, the symbol for each landmark
+    as text (``"2-0-1"``).
 
-    :param redraw_every: Number of episodes (or rollouts) for which a language stays, >= 1. None if it never changes. It is drawn
-        at the beginning of an episode
+    :param redraw_every: Number of episodes (or rollouts) for which a language stays, >= 1. None if it never changes. It is
+        drawn at the beginning of an episode
     :param redraw_unit: ``"episodes"`` or ``"rollouts"``
     :param per_copy: Whether each copy draws by itself. False is for rollouts only
     :param rollout_steps: With rollouts, the learner's ``n_steps``
@@ -75,7 +75,7 @@ class ForeignSpeaker(TeamGame[np.ndarray, int]):
         self._game: Any = self._mpe.unwrapped
         self.possible_agents = [LISTENER]
         self.agents: list[str] = []
-        own = self._mpe.observation_space(LISTENER).shape[0]  # type: ignore[index]
+        own = self._mpe.observation_space(LISTENER).shape[0]
         shape = (own + self._drawn.revealed,)
         self.observation_spaces: dict[str, spaces.Space] = {LISTENER: spaces.Box(-np.inf, np.inf, shape, np.float32)}
         self.action_spaces: dict[str, spaces.Space] = {LISTENER: spaces.Discrete(5)}
@@ -111,8 +111,8 @@ class ForeignSpeaker(TeamGame[np.ndarray, int]):
         Advance the episode by one step.
 
         :param actions: Action of the listener, in [0, 5)
-        :return: Observation, reward, termination (True at the last step), truncation (False) and infos, by agent. The infos also
-            hold ``partner``
+        :return: Observation, reward, termination (True at the last step), truncation (False) and infos, by agent. The infos
+            also hold ``partner``
         :raises ValueError: If the action is missing or not allowed, or if no episode is under way
         """
         self._require_episode()
@@ -153,7 +153,7 @@ class ForeignSpeaker(TeamGame[np.ndarray, int]):
 
         :return: {agent: (x, y)} as fractions of its width and height, from the upper left corner
         """
-        return {LISTENER: self._mpe.picture_positions()[LISTENER]}  # type: ignore[attr-defined]
+        return {LISTENER: self._mpe.picture_positions()[LISTENER]}
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -121,9 +121,10 @@ def test_only_with_the_oracle_a_learner_is_told_who_leads(reveal_partner):
 def test_the_oracle_observes_the_number_of_the_convention():
     env = ConventionEpisode(m=3, reveal_partner=True, rollout_steps=2)
     assert env.observation_space("follower") == spaces.MultiDiscrete([3, 6])
-    told = {}
+    told: dict[str, int] = {}
     for seed in range(40):
-        cue, number = env.reset(seed=seed)[0]["follower"]
+        observation: Any = env.reset(seed=seed)[0]["follower"]
+        cue, number = observation
         assert told.setdefault(env.partner, number) == number and cue == env.game.cue[0]
     assert sorted(told) == ["0-1-2", "0-2-1", "1-0-2", "1-2-0", "2-0-1", "2-1-0"]
     assert [told[name] for name in sorted(told)] == list(range(6))
