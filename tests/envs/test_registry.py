@@ -33,8 +33,6 @@ def test_all_ids_make_what_they_say():
     games = ["convention-swap", "convention-watch-act", "convention-redraw"]
     aisles = ["aisle-sides", "aisle-sides-kinds"]
     cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
-    tasks = ["convention-episode"]
-    tasks = ["convention-episode", "foreign-speaker"]
     tasks = ["convention-episode", "foreign-speaker", "picker", "lbf-heuristics"]
     assert registered_ids() == levels + games + aisles + cultures + tasks
     for env_id in games:
