@@ -212,14 +212,14 @@ def _meetings(contender: _Contender, entry: PoolEntry, options: AdaptOptions) ->
     if seats:
         shown = replace(shown, partners=_beside(contender, entry, seats, play.deterministic))
     with ExitStack() as stack:
-        envs = [
+        env, own_env = (
             stack.enter_context(closing(make_shown_env(shown, saved, n_envs, play.seed, where))) for n_envs in (play.n_envs, 1)
-        ]
-        team = load_into(contender.path, envs[0], saved, _COMMAND)
+        )
+        team = load_into(contender.path, env, saved, _COMMAND)
         if seats or entry.partners is None:
             if options.agent is not None:
                 raise ConfigError("--agent: all agents of the team learn beside these partners, so none can be chosen.")
-            yield [("", Meeting(team, list(team.agents), team, *envs))]
+            yield [("", Meeting(team, list(team.agents), team, env, own_env))]
             return
         if not isinstance(entry.partners, str):
             raise ConfigError(
@@ -230,9 +230,9 @@ def _meetings(contender: _Contender, entry: PoolEntry, options: AdaptOptions) ->
             raise ConfigError(f"{where}: {shown.env_id} has one agent only, so its partners are the environment's own.")
         if options.agent is not None and options.agent not in team.agents:
             raise unknown_setting("--agent", "agent", options.agent, team.agents)
-        others = load_into(Path(entry.partners), envs[0], saved, where)
+        others = load_into(Path(entry.partners), env, saved, where)
         chosen = list(team.agents) if options.agent is None else [options.agent]
-        yield [(agent, Meeting(team, [agent], Among(team, agent, others), *envs)) for agent in chosen]
+        yield [(agent, Meeting(team, [agent], Among(team, agent, others), env, own_env)) for agent in chosen]
 
 
 def _shown(shown: ShownEnvironment, entry: PoolEntry, saved: ShownTeam) -> ShownEnvironment:

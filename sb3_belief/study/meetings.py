@@ -253,7 +253,8 @@ class _Witness(VecEnvWrapper):
         actions = {agent: acted[agent] for agent in env.possible_agents}
         self._splitter = TransitionSplitter(env.possible_agents, actions, env.scripted_action_spaces)
         self._observed: Callable[[str, Any], Any] = team.observed_by
-        self._policies = {agent: team.agents[agent].policy for agent in agents if _predicts(team.agents[agent].policy)}
+        policies: dict[str, Any] = {agent: team.agents[agent].policy for agent in agents}
+        self._policies = {agent: policy for agent, policy in policies.items() if _predicts(policy)}
         # Observations and the others' actions at the steps in which the agent was in play
         self._seen: dict[str, list[tuple[Any, np.ndarray]]] = {agent: [] for agent in self._policies}
         self._obs: Any = None
