@@ -159,7 +159,7 @@ class Meeting:
         witness = _Witness(self.env, self.team, self.agents, self.told)
         self.env.seed(seed)
         with RngSwitch(RngState(seed)):
-            outcome = evaluate(self.model, witness, play.episodes, play.deterministic)  # type: ignore[arg-type]
+            outcome = evaluate(self.model, witness, play.episodes, play.deterministic)
         return Measured(outcome, *witness.accuracy())
 
     def adapt(self, checkpoints: Sequence[int], play: Play, repetition: int) -> dict[int, Measured]:
