@@ -1,5 +1,7 @@
 """What the tables of adapting and of cross-play say, worked out by hand, and how a report shows them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -38,7 +40,7 @@ def table():
 
 
 def test_the_curve_by_hand():
-    points = {(point.partner, point.steps): point for point in adaptation_points(table())}
+    points: dict[Any, Any] = {(point.partner, point.steps): point for point in adaptation_points(table())}
     assert list(points) == [(partner, steps) for partner in ("all", "left", "right") for steps in (0, 800)]
     last = points["all", 800]
     assert last.score.value == 4 and last.skill.value == pytest.approx(0.4)
@@ -86,7 +88,8 @@ def test_a_report_shows_what_lies_in_its_folder(tmp_path):
         for steps in (0, 800)
     ]
     write_rows(pairs, tmp_path / CROSSPLAY)
-    adapting, crossplay = adapting_sections(tmp_path)
+    sections: Any = adapting_sections(tmp_path)
+    adapting, crossplay = sections
     assert "is damaged" in adapting.blocks[1]
     (shown,) = [block for block in adapting.blocks if isinstance(block, Table)]
     assert [each["share"] for each in shown.rows] == [0, 0.75, 0, 0.5, 0, 1]

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from sb3_belief.team import Team, make_team_env
 from sb3_belief.zoo.errors import ConfigError
 
 EASY = "traffic-junction-easy"
-TINY = dict(
+TINY: dict[str, Any] = dict(
     n_steps=8, batch_size=16, n_epochs=1, history_length=12, policy_kwargs=dict(net_arch=[8], embedding_dim=8, latent_dim=4)
 )
 PLAY = Play(episodes=3, n_envs=2, repetitions=2)
@@ -116,7 +117,7 @@ def test_blind_and_oracle_bound_the_gap(teams, tmp_path):
     roles = {role: [row for row in rows if row["role"] == role] for role in ("team", "blind", "oracle")}
     assert len(roles["team"]) == 6 and len(roles["blind"]) == len(roles["oracle"]) == 2
     assert {row["return"] for row in roles["oracle"]} == {7.0} and {row["steps"] for row in roles["blind"]} == {0}
-    last = next(point for point in adaptation_points(rows) if point.partner == "all" and point.steps == 9)
+    last: Any = next(point for point in adaptation_points(rows) if point.partner == "all" and point.steps == 9)
     own = np.mean([row["return"] for row in roles[TEAM] if row["steps"] == 9])
     blind = np.mean([row["return"] for row in roles["blind"]])
     assert last.share.value == pytest.approx((own - blind) / (7 - blind))
@@ -208,7 +209,9 @@ def latin_square(m=4):
 def test_a_dynamic_belief_adapts_to_conventions_that_it_has_not_met(tmp_path, capsys):
     # The YAML entry of the conventions, which is trained for 60 of its 100 rollouts
     env = make_team_env("convention-swap", n_envs=50, seed=0)
-    settings = dict(n_steps=16, batch_size=400, n_epochs=4, learning_rate=1e-3, gamma=0.0, gae_lambda=0.0, ent_coef=0.01)
+    settings: dict[str, Any] = dict(
+        n_steps=16, batch_size=400, n_epochs=4, learning_rate=1e-3, gamma=0.0, gae_lambda=0.0, ent_coef=0.01
+    )
     sizes = dict(net_arch=[32, 32], embedding_dim=32, latent_dim=16)
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, device="cpu", policy_kwargs=sizes, **settings).learn(60 * 800)
     team.save(tmp_path / "follower.zip")
@@ -226,7 +229,7 @@ def test_a_dynamic_belief_adapts_to_conventions_that_it_has_not_met(tmp_path, ca
     assert (
         main([*words, "--partners", f"seed:{seeds}", "--steps", "0", "400", "800", "--repetitions", "2", "--blind", "4"]) == 0
     )
-    curve = [point for point in adaptation_points(rows_of(tmp_path)) if point.partner == "all"]
+    curve: Any = [point for point in adaptation_points(rows_of(tmp_path)) if point.partner == "all"]
     assert curve[0].score.value / 16 == pytest.approx(0.25, abs=0.05) and curve[0].skill.value < 0.1
     assert curve[-1].score.value / 16 > 0.95 and curve[-1].skill.value > 0.6
     assert "after 0 observed steps" in capsys.readouterr().out

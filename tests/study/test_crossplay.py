@@ -1,5 +1,7 @@
 """Cross-play: the diagonal is the plain evaluation, and what it says follows from its table."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import yaml
@@ -46,7 +48,7 @@ def test_the_diagonal_is_the_plain_evaluation(teams, tmp_path):
 
 
 def test_runs_are_the_unit_of_the_interval():
-    found = crossplay_estimates(np.array([[5.0, 1, 3], [0, 7, 2], [4, 4, 9]]))
+    found: Any = crossplay_estimates(np.array([[5.0, 1, 3], [0, 7, 2], [4, 4, 9]]))
     assert [found[name].value for name in ("own", "others", "loss")] == pytest.approx([7, 7 / 3, 14 / 3])
     assert found["loss"].n_seeds == 3 and found["loss"].low < found["loss"].value < found["loss"].high
 
