@@ -3,8 +3,7 @@ Scripted players of Level-Based Foraging: pickers with a fixed order of collecti
 
 The heuristics are written from their published description: H1 goes to the closest food; H2 to the food closest to the centre
 of all visible players; H3 to the closest food that it can load by its own level; H4 to the food closest to the centre of the
-visible players that their levels together can load. Their use as types of partners goes back to Albrecht and Ramamoorthy
-(2013), "A Game-Theoretic Model and Best-Response Learning Method for Ad Hoc Coordination in Multiagent Systems".
+visible players that their levels together can load.
 """
 
 from collections import deque
