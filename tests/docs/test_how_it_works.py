@@ -114,7 +114,7 @@ def joint_step() -> Entered:
     [
         ("A rollout step of BeliefPPO", rollout_step, 7),
         ("A minibatch of an update", minibatch, 6),
-        ("A joint step of a team", joint_step, 16),
+        ("A joint step of a team", joint_step, 17),
     ],
 )
 def test_the_lists_are_the_paths(title, path, most):
