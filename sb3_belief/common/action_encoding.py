@@ -23,21 +23,6 @@ class ActionEncoding(NamedTuple):
         """Width of the whole vector."""
         return sum(self.widths)
 
-    def encode(self, actions: np.ndarray) -> np.ndarray:
-        """
-        Encode actions.
-
-        :param actions: One in each row, ``[n, ...]``
-        :return: float32 ``[n, width]``
-        """
-        rows = actions.reshape(len(actions), -1)
-        if self.kind != "categorical":
-            return rows.astype(np.float32)
-        offsets = np.concatenate([[0], np.cumsum(self.widths)[:-1]]).astype(int)
-        flat = np.zeros((len(rows), self.width), dtype=np.float32)
-        flat[np.arange(len(rows))[:, None], rows.astype(int) + offsets] = 1.0
-        return flat
-
 
 def action_encoding(name: str, space: spaces.Space) -> ActionEncoding:
     """

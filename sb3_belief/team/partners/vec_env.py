@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sb3_belief.common.action_encoding import action_encoding
+from sb3_belief.common.action_encoding import RowEncoder
 from sb3_belief.common.safe_files.trust import Trust
 from sb3_belief.team.fixed_partners.partners import CallersRng, PartnerLike
 from sb3_belief.team.partners.acting import CopiesPartner, Seat
@@ -114,7 +114,7 @@ class PartnersVecEnv(TeamVecEnv):
             ]
             index = env.possible_agents.index(agent)
             self._seats.append((Seat(agent, index, actions[agent], acting, self.num_envs), draws))
-        self._encodings = {name: action_encoding(name, space) for name, space in partner_spaces.items()}
+        self._encoders = {name: RowEncoder(name, space) for name, space in partner_spaces.items()}
         self._learner_rows, self._columns = _visible_places(env, learners, list(partner_spaces))
 
     # The agents' steps
@@ -134,7 +134,7 @@ class PartnersVecEnv(TeamVecEnv):
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         by_partners = self._partners_actions()
         obs, _, dones, infos = self.env.step({**actions, **by_partners})
-        encoded = np.concatenate([encoding.encode(by_partners[name]) for name, encoding in self._encodings.items()], axis=1)
+        encoded = np.concatenate([encode(by_partners[name]) for name, encode in self._encoders.items()], axis=1)
         ended = self._own_ends(infos) | dones[:, None]
         names = self.partner_names if self._named else None
         rewards = self._tell_learners(infos, encoded, names)
