@@ -18,23 +18,30 @@ class TeamVecEnvWrapper(TeamVecEnv):
     from the ``TeamVecEnv`` itself, so what changes these has to be one.
 
     :param venv: The environment within
-    :param observation_spaces: Observation space of each agent, in place of that of ``venv``
+    :param observation_spaces: Observation space of each agent that is one to the outside, in place of that of ``venv``
+    :param scripted_action_spaces: Action spaces of the others who act within. None for those of ``venv``
     """
 
-    def __init__(self, venv: TeamVecEnv, observation_spaces: Mapping[str, spaces.Space]):
+    def __init__(
+        self,
+        venv: TeamVecEnv,
+        observation_spaces: Mapping[str, spaces.Space],
+        scripted_action_spaces: Mapping[str, spaces.Space] | None = None,
+    ):
         #: The environment within
         self.venv = venv
         acted: Any = venv.action_space
-        agents = venv.possible_agents
         super().__init__(
             venv.num_envs,
-            agents,
+            list(observation_spaces),
             observation_spaces,
-            {agent: acted[agent] for agent in agents},
+            {agent: acted[agent] for agent in observation_spaces},
             render_mode=venv.render_mode,
-            scripted_action_spaces=venv.scripted_action_spaces,
+            scripted_action_spaces=venv.scripted_action_spaces if scripted_action_spaces is None else scripted_action_spaces,
         )
-        self.reports_success = venv.reports_success
+        # What was asked of the environment within holds for this one
+        self.reports_success, self._seeds = venv.reports_success, list(venv._seeds)
+        self.monitor_dir, venv.monitor_dir = venv.monitor_dir, None
 
     @property
     def n_restarts(self) -> int:
@@ -52,7 +59,8 @@ class TeamVecEnvWrapper(TeamVecEnv):
         self.venv.begin_rollout()
 
     def action_masks(self) -> dict[str, np.ndarray] | None:
-        return self.venv.action_masks()
+        masks = self.venv.action_masks()
+        return None if masks is None else {agent: masks[agent] for agent in self.possible_agents if agent in masks}
 
     def close(self) -> None:
         super().close()

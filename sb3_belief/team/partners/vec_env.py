@@ -1,6 +1,6 @@
 """The environment of a team in which some agents are partners: they act within it and do not learn."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,6 +14,7 @@ from sb3_belief.team.fixed_partners.partners import CallersRng, PartnerLike
 from sb3_belief.team.partners.acting import CopiesPartner, Seat
 from sb3_belief.team.partners.pool import PartnerPool, PoolDraws
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
+from sb3_belief.vec_env.team_wrapper import TeamVecEnvWrapper
 
 # Partners by agent: what ``AgentEnv`` takes as a partner, or a pool
 Partners: TypeAlias = Mapping[str, PartnerLike | PartnerPool]
@@ -25,7 +26,7 @@ _OF_AGENTS = ("terminal_observation", "terminal_action_masks", "agent_infos")
 _OWN_ATTRIBUTES = frozenset(("action_masks", "possible_agents", "scripted_action_spaces"))
 
 
-class PartnersVecEnv(TeamVecEnv):
+class PartnersVecEnv(TeamVecEnvWrapper):
     """
     A ``TeamVecEnv`` around another one, in which partners act for some of its agents.
 
@@ -43,47 +44,41 @@ class PartnersVecEnv(TeamVecEnv):
     the agents, followed by what the environment itself says. ``get_attr("partner")`` says who will act. Nothing of it is
     in the infos of an agent. An episode in which a partner was replaced, as by a rollout's begin, counts for the last one.
 
-    :param env: The environment; it is closed with this one
+    :param venv: The environment; it is closed with this one
     :param partners: A partner, or a ``PartnerPool`` of them, by agent; at least one agent is left to learn. The same pool for
         several agents is drawn once for all of them
     :param deterministic: Whether partners with a ``predict`` take their most likely actions; False samples, as in training
     :param evaluation: Whether pools are those of evaluations (``PartnerPool.evaluation``) instead of those of training
     :param trust_pickle: As for ``AgentEnv``
     :param allow_packages: As for ``AgentEnv``
-    :raises TypeError: If ``env``, ``partners`` or a partner is of an unsuitable type
+    :raises TypeError: If ``venv``, ``partners`` or a partner is of an unsuitable type
     :raises ValueError: For unknown agents, if none is left to learn, or if a partner does not fit
     """
 
     def __init__(
         self,
-        env: TeamVecEnv,
+        venv: TeamVecEnv,
         partners: Partners,
         deterministic: bool = False,
         evaluation: bool = False,
         trust_pickle: bool = False,
         allow_packages: Iterable[str] = (),
     ):
-        if not isinstance(env, TeamVecEnv):
+        if not isinstance(venv, TeamVecEnv):
             raise TypeError(
-                f"Partners act in a TeamVecEnv itself (see make_team_env), not in a {type(env).__name__}: put wrappers around"
+                f"Partners act in a TeamVecEnv itself (see make_team_env), not in a {type(venv).__name__}: put wrappers around"
                 " the PartnersVecEnv."
             )
-        given = _checked(partners, env.possible_agents)
-        self.env = env
-        learners = [agent for agent in env.possible_agents if agent not in given]
-        actions: Any = env.action_space
-        partner_spaces: dict[str, spaces.Space] = {a: actions[a] for a in env.possible_agents if a in given}
+        given = _checked(partners, venv.possible_agents)
+        observed: Any = venv.observation_space
+        actions: Any = venv.action_space
+        learners = [agent for agent in venv.possible_agents if agent not in given]
+        partner_spaces: dict[str, spaces.Space] = {agent: actions[agent] for agent in given}
         super().__init__(
-            env.num_envs,
-            learners,
-            {agent: env.observation_space[agent] for agent in learners},  # type: ignore[index]
-            {agent: actions[agent] for agent in learners},
-            env.render_mode,
-            {**partner_spaces, **env.scripted_action_spaces},
+            venv,
+            {agent: observed[agent] for agent in learners},
+            scripted_action_spaces={**partner_spaces, **venv.scripted_action_spaces},
         )
-        # What was asked of the environment holds for this one
-        self.reports_success, self._seeds = env.reports_success, list(env._seeds)
-        self.monitor_dir, env.monitor_dir = env.monitor_dir, None
         self._callers_rng = CallersRng(0)
         # Who is in no pool is one of his own, and stays for ever
         self._pools = {
@@ -105,17 +100,17 @@ class PartnersVecEnv(TeamVecEnv):
                 CopiesPartner(
                     agent,
                     _member(pool, name, agent, self._pools),
-                    env.observation_space[agent],  # type: ignore[index]
+                    observed[agent],
                     actions[agent],
                     deterministic,
                     trust=trust,
                 )
                 for name in draws.names
             ]
-            index = env.possible_agents.index(agent)
+            index = venv.possible_agents.index(agent)
             self._seats.append((Seat(agent, index, actions[agent], acting, self.num_envs), draws))
         self._encoders = {name: RowEncoder(name, space) for name, space in partner_spaces.items()}
-        self._learner_rows, self._columns = _visible_places(env, learners, list(partner_spaces))
+        self._learner_rows, self._columns = _visible_places(venv, learners, list(partner_spaces))
 
     # The agents' steps
 
@@ -126,26 +121,26 @@ class PartnersVecEnv(TeamVecEnv):
         else:
             # Episodes that are cut off by a reset are over, too
             self._end_episodes(np.flatnonzero(self._lengths))
-        obs = self.env.reset()
+        obs = super()._reset_joint()
         for seat, _ in self._seats:
             seat.reset(obs[seat.agent], self._seeds[0])
         return {agent: obs[agent] for agent in self.possible_agents}
 
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         by_partners = self._partners_actions()
-        obs, _, dones, infos = self.env.step({**actions, **by_partners})
+        obs, _, dones, infos = super()._step_joint({**actions, **by_partners})
         encoded = np.concatenate([encode(by_partners[name]) for name, encode in self._encoders.items()], axis=1)
         ended = self._own_ends(infos) | dones[:, None]
         names = self.partner_names if self._named else None
         rewards = self._tell_learners(infos, encoded, names)
         for seat, _ in self._seats:
-            seat.observe(obs[seat.agent], ended[:, self.env.possible_agents.index(seat.agent)])
+            seat.observe(obs[seat.agent], ended[:, self.venv.possible_agents.index(seat.agent)])
         if dones.any():
             self._end_episodes(np.flatnonzero(dones))
         return {agent: obs[agent] for agent in self.possible_agents}, rewards, dones, infos
 
     def _partners_actions(self) -> TeamObs:
-        masks = self.env.action_masks() or {}
+        masks = self.venv.action_masks() or {}
         # SB3 models draw from the global generators, so each partner gets its own state of them while it acts
         self._callers_rng.suspend()
         try:
@@ -177,15 +172,6 @@ class PartnersVecEnv(TeamVecEnv):
                 info["partner"] = "+".join([names[i], info["partner"]] if "partner" in info else [names[i]])
         return own["agent_rewards"].mean(axis=1, dtype=np.float32)
 
-    def action_masks(self) -> dict[str, np.ndarray] | None:
-        """
-        Return the learners' masks for the current observations.
-
-        :return: bool ``[num_envs, k]`` by agent, or None if the environment has no masks
-        """
-        masks = self.env.action_masks()
-        return None if masks is None else {agent: masks[agent] for agent in self.possible_agents if agent in masks}
-
     # Who is there
 
     @property
@@ -195,7 +181,7 @@ class PartnersVecEnv(TeamVecEnv):
 
     def begin_rollout(self) -> None:
         """Draw again from the pools whose partners stay for some rollouts, where it is time."""
-        self.env.begin_rollout()
+        super().begin_rollout()
         for draws in self._draws.values():
             draws.begin_rollout()
 
@@ -203,87 +189,43 @@ class PartnersVecEnv(TeamVecEnv):
         for draws in self._draws.values():
             draws.end_episodes(copies.tolist())
 
-    # Everything else is the environment's
-
-    @property
-    def n_restarts(self) -> int:
-        """How often copies have been made anew after a fault."""
-        return getattr(self.env, "n_restarts", 0)
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """
-        Seed the copies, and the partners' random numbers and draws, at the next reset.
-
-        :param seed: Copy i gets ``seed + i``
-        :return: The copies' seeds
-        """
-        self._seeds = list(self.env.seed(seed))
-        return self._seeds
-
-    def set_options(self, options: list[dict] | dict | None = None) -> None:
-        """
-        Set the options of the copies' next reset.
-
-        :param options: One dict for all copies, or a list of one for each
-        """
-        self.env.set_options(options)
-
-    def close(self) -> None:
-        """Close the monitor files and the environment."""
-        super().close()
-        self.env.close()
-
-    def get_images(self) -> Sequence[np.ndarray | None]:
-        return self.env.get_images()
+    def has_attr(self, attr_name: str) -> bool:
+        return attr_name in _OWN_ATTRIBUTES or (attr_name == "partner" and bool(self._named)) or super().has_attr(attr_name)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         if attr_name in _OWN_ATTRIBUTES:
-            return super().get_attr(attr_name, indices)
+            return TeamVecEnv.get_attr(self, attr_name, indices)
         if attr_name != "partner" or not self._named:
-            return self.env.get_attr(attr_name, indices)
+            return super().get_attr(attr_name, indices)
         names = [self.partner_names[i] for i in self._get_indices(indices)]
         try:
-            inside = self.env.get_attr(attr_name, indices)
+            inside = super().get_attr(attr_name, indices)
         except AttributeError:
             return names
         return [f"{name}+{other}" for name, other in zip(names, inside, strict=True)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        self.env.set_attr(attr_name, value, indices)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         if method_name == "action_masks":
-            return super().env_method(method_name, indices=indices)
-        return self.env.env_method(method_name, *method_args, indices=indices, **method_kwargs)
+            return TeamVecEnv.env_method(self, method_name, indices=indices)
+        return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
-    def get_state(self) -> dict[str, Any]:
-        """
-        Return everything that determines the following steps: the environment's state, and of the partners their random
-        numbers, recurrent states and draws. What a function of the user's own remembers is not part of it.
-
-        :return: Plain data
-        """
+    def _copies_state(self) -> dict[str, Any]:
+        # Of the partners their random numbers, recurrent states and draws; what a user's own function remembers is not in it
         return {
-            "env": self.env.exact_state(),
+            "env": super()._copies_state(),
             "partners": {seat.agent: seat.get_state() for seat, _ in self._seats},
             "draws": [draws.get_state() for draws in self._draws.values()],
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Go on where another environment with the same partners was.
-
-        :param state: As :meth:`get_state` returned it
-        :raises ValueError: If it had other partners
-        """
+    def _set_copies_state(self, state: dict[str, Any]) -> None:
         agents = [seat.agent for seat, _ in self._seats]
         if list(state["partners"]) != agents or len(state["draws"]) != len(self._draws):
             raise ValueError(f"The saved state has partners for {list(state['partners'])}, here they are for {agents}.")
         for draws, saved in zip(self._draws.values(), state["draws"], strict=True):
             draws.set_state(saved)
-        self.env.set_exact_state(state["env"])
+        super()._set_copies_state(state["env"])
         for seat, _ in self._seats:
             seat.set_state(state["partners"][seat.agent])
 
