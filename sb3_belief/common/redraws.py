@@ -6,6 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from sb3_belief.common.checks import check_integer
+
 UNITS = ("rollouts", "episodes")
 
 
@@ -32,12 +34,9 @@ class RedrawSchedule:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, least, meaning in (
-            ("every", 1 if self.every is None else self.every, 1, f"for how many {self.unit} a partner stays, or None"),
-            ("seed", self.seed, 0, "which decides who is drawn"),
-        ):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"{name}={value!r} must be an integer >= {least}: {meaning}.")
+        if self.every is not None:
+            check_integer("every", self.every, 1, f"for how many {self.unit} a partner stays, or None")
+        check_integer("seed", self.seed, 0, "which decides who is drawn")
         if self.unit not in UNITS:
             raise ValueError(f"unit={self.unit!r} is not one of {', '.join(map(repr, UNITS))}.")
         if not isinstance(self.per_copy, bool):

@@ -116,3 +116,18 @@ def require_render_mode(render_mode: str | None, modes: Sequence[str]) -> str:
     if render_mode is None:
         raise ValueError(f"This environment was made without a render mode: pass render_mode, one of {tuple(modes)}.")
     return render_mode
+
+
+def check_same_arguments(saved: object, own: object) -> None:
+    """
+    Check that a state comes from an environment of the same arguments.
+
+    :param saved: Those of the state
+    :param own: Those of the environment that is to go on from it
+    :raises ValueError: If they differ
+    """
+    if saved != own:
+        raise ValueError(
+            f"The state is of an environment with {saved}, this one has {own}: a state can only be restored in an environment"
+            " with the same arguments."
+        )

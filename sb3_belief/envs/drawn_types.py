@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.common.redraws import RedrawSchedule
 
 
@@ -46,22 +47,6 @@ class TypeRules:
     def schedule(self) -> RedrawSchedule:
         """When a type is drawn, and which."""
         return RedrawSchedule(self.redraw_every, self.redraw_unit, self.per_copy, self.partner_seed)
-
-
-def check_integer(name: str, value: object, least: int, meaning: str, most: int | None = None) -> None:
-    """
-    Check an argument that counts something.
-
-    :param name: Name of the argument
-    :param value: What the user gave
-    :param least: Smallest value that is allowed
-    :param meaning: What the argument is, for the message
-    :param most: Largest value that is allowed, None if there is none
-    :raises ValueError: If it is not an integer of that range
-    """
-    if not isinstance(value, int) or isinstance(value, bool) or value < least or (most is not None and value > most):
-        allowed = f">= {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name}={value!r} must be an integer {allowed}: {meaning}.")
 
 
 class DrawnTypes:

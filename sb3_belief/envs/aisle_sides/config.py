@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from sb3_belief.envs.drawn_types import TypeRules, check_integer
+from sb3_belief.common.checks import check_integer
+from sb3_belief.envs.drawn_types import TypeRules
 
 MIDDLE, LEFT, RIGHT = 0, 1, 2
 MOST_KINDS = 6

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_belief.envs.aisle_sides.config import LEFT, MIDDLE, AisleConfig, convention_sides
+from sb3_belief.envs.base import check_same_arguments
 from sb3_belief.envs.drawn_types import DrawnTypes
 
 NOBODY = -1
@@ -173,12 +174,7 @@ class AisleCore:
         :param state: State that ``get_state`` returned for a copy with the same rules
         :raises ValueError: If the rules differ
         """
-        rules = asdict(self.config)
-        if state["config"] != rules:
-            raise ValueError(
-                f"The state is of an environment with {state['config']}, this one has {rules}: a state can only be restored in"
-                " an environment with the same arguments."
-            )
+        check_same_arguments(state["config"], asdict(self.config))
         for name in _STATE_ARRAYS:
             # New arrays, since those of the last step may be the caller's own
             array = getattr(self, name).copy()

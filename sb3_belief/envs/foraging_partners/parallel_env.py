@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.envs.adapters import lbf
 from sb3_belief.envs.base import ResetResult, StepResult, TeamGame
 from sb3_belief.envs.drawn_partner import DrawnPartner, partner_schedule
@@ -74,10 +75,9 @@ class PartneredForaging(TeamGame[np.ndarray, int]):
     ):
         if partners not in PARTNERS:
             raise ValueError(f"partners={partners!r} is not one of {', '.join(map(repr, PARTNERS))}.")
-        for name, value, least in (("partner_sight", partner_sight, 0), ("max_episode_steps", max_episode_steps, 1)):
-            is_number = isinstance(value, int) and not isinstance(value, bool) and value >= least
-            if not is_number and not (name == "partner_sight" and value is None):
-                raise ValueError(f"{name}={value!r} must be an integer >= {least}.")
+        if partner_sight is not None:
+            check_integer("partner_sight", partner_sight, 0, "within how many cells the partner is seen, or None for anywhere")
+        check_integer("max_episode_steps", max_episode_steps, 1, "the length of an episode")
         schedule = partner_schedule(redraw_every, redraw_unit, per_copy, partner_seed)
         self._choices = PARTNERS[partners]
         self._drawn = DrawnPartner(list(self._choices), schedule, rollout_steps, reveal_partner)

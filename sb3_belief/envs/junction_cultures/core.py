@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.envs.base import check_same_arguments
 from sb3_belief.envs.drawn_types import DrawnTypes
 from sb3_belief.envs.junction_cultures.config import CultureConfig
 from sb3_belief.envs.traffic_junction.core import BRAKE, GAS, Step, TrafficCore
@@ -144,12 +145,7 @@ class CultureCore:
         :param state: State that ``get_state`` returned for a copy with the same rules
         :raises ValueError: If the rules differ
         """
-        rules = asdict(self.config)
-        if state["config"] != rules:
-            raise ValueError(
-                f"The state is of an environment with {state['config']}, this one has {rules}: a state can only be restored in"
-                " an environment with the same arguments."
-            )
+        check_same_arguments(state["config"], asdict(self.config))
         self.traffic.set_state(copy, state["traffic"])
         self.types.set_state(copy, state["types"])
         self.actions[copy], self.saw[copy] = state["actions"], state["saw"]

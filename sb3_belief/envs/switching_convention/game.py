@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.common.redraws import RedrawSchedule
+from sb3_belief.envs.base import check_same_arguments
 
 REWARDED = ("always", "last")
 
@@ -43,19 +45,11 @@ class ConventionConfig:
     per_copy: bool = False
 
     def __post_init__(self) -> None:
-        for name, value, least, meaning in (
-            ("m", self.m, 2, "the number of cues and actions"),
-            (
-                "K",
-                1 if self.K is None else self.K,
-                1,
-                "for how many rollouts a convention is valid, or None for all",
-            ),
-            ("rollout_steps", self.rollout_steps, 1, "the n_steps of the learner"),
-            ("seed", self.seed, 0, "which decides the sequence of conventions"),
-        ):
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"{name}={value!r} must be an integer >= {least}: {meaning}.")
+        check_integer("m", self.m, 2, "the number of cues and actions")
+        if self.K is not None:
+            check_integer("K", self.K, 1, "for how many rollouts a convention is valid, or None for all")
+        check_integer("rollout_steps", self.rollout_steps, 1, "the n_steps of the learner")
+        check_integer("seed", self.seed, 0, "which decides the sequence of conventions")
         if self.rewarded not in REWARDED:
             raise ValueError(f"rewarded={self.rewarded!r} is not one of {', '.join(map(repr, REWARDED))}.")
         if self.rewarded == "last" and self.K is None:
@@ -216,13 +210,8 @@ class ConventionGame:
         :param state: State that ``get_state`` returned for a copy with the same rules
         :raises ValueError: If the rules differ
         """
-        rules = asdict(self.config)
         # A state that was saved before there were these rules lacks them, and the counts that they need
-        if {**asdict(ConventionConfig()), **state["config"]} != rules:
-            raise ValueError(
-                f"The state is of an environment with {state['config']}, this one has {rules}: a state can only be restored in"
-                " an environment with the same arguments."
-            )
+        check_same_arguments({**asdict(ConventionConfig()), **state["config"]}, asdict(self.config))
         self.cues[copy] = state["cues"]
         self.generators[copy].bit_generator.state = state["generator"]
         for name in ("time", "age", "leader", "episode", "copy_seeds"):

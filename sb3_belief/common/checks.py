@@ -1,0 +1,17 @@
+"""Checks of what a user gives, with messages that name the argument and what is allowed."""
+
+
+def check_integer(name: str, value: object, least: int, meaning: str, most: int | None = None) -> None:
+    """
+    Check an argument that counts something.
+
+    :param name: Name of the argument
+    :param value: What the user gave
+    :param least: Smallest value that is allowed
+    :param meaning: What the argument is, for the message
+    :param most: Largest value that is allowed, None if there is none
+    :raises ValueError: If it is not an integer of that range
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or value < least or (most is not None and value > most):
+        allowed = f">= {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name}={value!r} must be an integer {allowed}: {meaning}.")
