@@ -130,11 +130,13 @@ def adaptation_points(rows: Sequence[Row]) -> list[AdaptationPoint]:
     """
     steps = sorted({row["steps"] for row in rows if row["role"] == TEAM})
     blind, oracle = by_partner(rows, BLIND, 0), by_partner(rows, ORACLE, 0)
-    partners = list(by_partner(rows, TEAM, steps[0]))
+    owns = {n: by_partner(rows, TEAM, n) for n in steps}
+    skills = {n: by_partner(rows, TEAM, n, "skill") for n in steps}
+    partners = list(owns[steps[0]])
     points = []
     for name, of in [(ALL, partners), *((partner, [partner]) for partner in partners)]:
         for n in steps:
-            own, skill = by_partner(rows, TEAM, n), by_partner(rows, TEAM, n, "skill")
+            own, skill = owns[n], skills[n]
             points.append(
                 AdaptationPoint(
                     name,
@@ -171,21 +173,23 @@ def _share(strata: Sequence[np.ndarray]) -> IntervalEstimate | None:
     return IntervalEstimate(value, low, high, strata[0].shape[-1])
 
 
-def adaptation_figure(rows: Sequence[Row], title: str, skill: bool = False) -> dict[str, Any]:
+def adaptation_figure(
+    rows: Sequence[Row], points: Sequence[AdaptationPoint], title: str, skill: bool = False
+) -> dict[str, Any]:
     """
     Return the picture of the curve of adapting: with its interval, each partner as a thin line, and blind and oracle.
 
     :param rows: The table
+    :param points: Its curve, as :func:`adaptation_points` returns it
     :param title: Title
     :param skill: Whether to draw the skill of the predictions instead of the return
     :return: The specification
     """
-    points = [point for point in adaptation_points(rows) if not skill or point.skill is not None]
     drawn: dict[str, list[tuple[int, IntervalEstimate]]] = {}
     for point in points:
         estimated = point.skill if skill else point.score
-        assert estimated is not None
-        drawn.setdefault(point.partner, []).append((point.steps, estimated))
+        if estimated is not None:
+            drawn.setdefault(point.partner, []).append((point.steps, estimated))
     mean = drawn.pop(ALL)
     x = [float(steps) for steps, _ in mean]
     curves = {TEAM: _curve(x, [each for _, each in mean], {name: [e.value for _, e in of] for name, of in drawn.items()})}
@@ -220,14 +224,14 @@ def _curve(
     )
 
 
-def adaptation_sentences(rows: Sequence[Row]) -> str:
+def adaptation_sentences(rows: Sequence[Row], points: Sequence[AdaptationPoint]) -> str:
     """
     Say in a paragraph how a team adapts.
 
     :param rows: The table
+    :param points: Its curve, as :func:`adaptation_points` returns it
     :return: The paragraph
     """
-    points = adaptation_points(rows)
     curve = [point for point in points if point.partner == ALL]
     first, last = curve[0], curve[-1]
     partners = [point for point in points if point.partner != ALL and point.steps == last.steps]
@@ -235,20 +239,20 @@ def adaptation_sentences(rows: Sequence[Row]) -> str:
     own = next(row for row in rows if row["role"] == TEAM)
     said = [
         f"{own['run']} beside {n} partner{'s' * (n > 1)} on {own['environment']} (means over {first.score.n_seeds} repetitions"
-        f" each, 95 % intervals over these): return {_text(first.score)} after {first.steps} observed steps,"
-        f" {_text(last.score)} after {last.steps}."
+        f" each, 95 % intervals over these): return {estimate_text(first.score)} after {first.steps} observed steps,"
+        f" {estimate_text(last.score)} after {last.steps}."
     ]
     blind, oracle = (
         [estimate(list(of.values()), "mean")] if of else [] for of in (by_partner(rows, r, 0) for r in (BLIND, ORACLE))
     )
     if blind and oracle:
-        gap = f"between blind ({_text(blind[0])}) and oracle ({_text(oracle[0])})"
+        gap = f"between blind ({estimate_text(blind[0])}) and oracle ({estimate_text(oracle[0])})"
         if first.share is None or last.share is None:
             said.append(f"There is no gap {gap}.")
         else:
             said.append(f"Of the gap {gap} that closes {first.share.value:.0%}, then {_percent(last.share)}.")
     if first.skill is not None and last.skill is not None:
-        said.append(f"Its predictions are {_text(first.skill)}, then {_text(last.skill)} above the base rate.")
+        said.append(f"Its predictions are {estimate_text(first.skill)}, then {estimate_text(last.skill)} above the base rate.")
     regrets = [(point.regret.value, point.partner) for point in partners if point.regret is not None]
     worst, partner = max(regrets, default=(0.0, ""))
     if worst > 0:
@@ -256,7 +260,13 @@ def adaptation_sentences(rows: Sequence[Row]) -> str:
     return " ".join(said)
 
 
-def _text(each: IntervalEstimate) -> str:
+def estimate_text(each: IntervalEstimate) -> str:
+    """
+    Return an estimate as text.
+
+    :param each: The estimate
+    :return: Such as ``"4 [3.5, 4.5]"``, without brackets if there is no interval
+    """
     return f"{each.value:.3g}" + ("" if each.low is None else f" [{each.low:.3g}, {each.high:.3g}]")
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.report.adaptation import Row
+from sb3_belief.report.adaptation import Row, estimate_text
 from sb3_belief.report.figures.matrix import matrix_spec
 from sb3_belief.report.statistics import IntervalEstimate, estimate
 
@@ -84,8 +84,9 @@ def crossplay_sentences(rows: Sequence[Row]) -> str:
         found = crossplay_estimates(crossplay_matrix(rows, steps))
         when = "Before observing" if steps == 0 else f"After {steps:.0f} observed steps"
         said.append(
-            f"{when} the team's return is {_text(found['own'])} where an agent is among its own, {_text(found['others'])}"
-            f" where it is among those of another run: a loss of {_text(found['loss'])}."
+            f"{when} the team's return is {estimate_text(found['own'])} where an agent is among its own,"
+            f" {estimate_text(found['others'])} where it is among those of another run: a loss of"
+            f" {estimate_text(found['loss'])}."
         )
     n_repetitions = len({row["repetition"] for row in rows})
     return (
@@ -96,7 +97,3 @@ def crossplay_sentences(rows: Sequence[Row]) -> str:
 
 def _steps(rows: Sequence[Row]) -> list[float]:
     return sorted({row["steps"] for row in rows})
-
-
-def _text(each: IntervalEstimate) -> str:
-    return f"{each.value:.3g}" + ("" if each.low is None else f" [{each.low:.3g}, {each.high:.3g}]")

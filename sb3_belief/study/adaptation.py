@@ -127,17 +127,18 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
             if row["partner"] == entry.name and row["role"] == TEAM and row["steps"] == options.checkpoints[0]
         ]
         print(f"{number} of {len(entries)}: {_line(rows, entry.name, options.checkpoints)}", flush=True)
+    points = adaptation_points(rows)
     try:
         make_folder(output)
         write_rows(rows, output / ADAPTATION)
-        write_rows([point.columns() for point in adaptation_points(rows)], output / CURVE)
+        write_rows([point.columns() for point in points], output / CURVE)
         title = f"{rows[0]['run']}, {rows[0]['environment']}"
-        write_figure(adaptation_figure(rows, title), output / "adaptation.svg", output / "adaptation.png")
+        write_figure(adaptation_figure(rows, points, title), output / "adaptation.svg", output / "adaptation.png")
         if any(row["accuracy"] is not None for row in rows):
-            write_figure(adaptation_figure(rows, title, skill=True), output / "skill.svg", output / "skill.png")
+            write_figure(adaptation_figure(rows, points, title, skill=True), output / "skill.svg", output / "skill.png")
     except OSError as error:
         raise ConfigError(f"-o: cannot write into {short(str(output))} ({reason_of(error)}).") from None
-    return output, adaptation_sentences(rows)
+    return output, adaptation_sentences(rows, points)
 
 
 def _number(given: str | None) -> float | None:

@@ -40,7 +40,8 @@ def table():
 
 
 def test_the_curve_by_hand():
-    points: dict[Any, Any] = {(point.partner, point.steps): point for point in adaptation_points(table())}
+    curve = adaptation_points(table())
+    points: dict[Any, Any] = {(point.partner, point.steps): point for point in curve}
     assert list(points) == [(partner, steps) for partner in ("all", "left", "right") for steps in (0, 800)]
     last = points["all", 800]
     assert last.score.value == 4 and last.skill.value == pytest.approx(0.4)
@@ -48,8 +49,8 @@ def test_the_curve_by_hand():
     assert last.share.value == 0.75 and last.share.low < 0.75 < last.share.high
     assert points["left", 800].regret.value == 2 and points["right", 800].regret.value == 0
     assert points["all", 0].share.value == 0
-    assert "closes 0%, then 75%" in adaptation_sentences(table())
-    assert "largest regret after 800 steps is 2, beside left" in adaptation_sentences(table())
+    assert "closes 0%, then 75%" in adaptation_sentences(table(), curve)
+    assert "largest regret after 800 steps is 2, beside left" in adaptation_sentences(table(), curve)
 
 
 def test_agents_are_averaged_before_repetitions():
@@ -62,8 +63,9 @@ def test_agents_are_averaged_before_repetitions():
 
 def test_without_a_gap_there_is_no_share():
     rows = [{**each, "return": 1.0} if each["role"] == "oracle" else each for each in table()]
-    assert all(point.share is None for point in adaptation_points(rows) if point.partner == "all")
-    assert "There is no gap between blind" in adaptation_sentences(rows)
+    points = adaptation_points(rows)
+    assert all(point.share is None for point in points if point.partner == "all")
+    assert "There is no gap between blind" in adaptation_sentences(rows, points)
 
 
 def test_a_table_is_read_as_it_was_written(tmp_path):

@@ -58,10 +58,11 @@ def adapting_sections(folder: Path) -> list[PageSection]:
 
 def _adaptation(path: Path, name: str) -> list[Any]:
     rows = read_rows(path, TEXTS, NUMBERS)
+    points = adaptation_points(rows)
     title = f"{rows[0]['run']}, {rows[0]['environment']}"
-    figures = [Figure(name, title, adaptation_figure(rows, title), "Return over the steps observed since the swap")]
+    figures = [Figure(name, title, adaptation_figure(rows, points, title), "Return over the steps observed since the swap")]
     if any(row["accuracy"] is not None for row in rows):
-        spec = adaptation_figure(rows, title, skill=True)
+        spec = adaptation_figure(rows, points, title, skill=True)
         figures.append(Figure(f"{name}-skill", title, spec, "Accuracy above the base rate over the steps observed"))
     columns = [
         Column("partner", "partner"),
@@ -71,7 +72,6 @@ def _adaptation(path: Path, name: str) -> list[Any]:
         *_estimated("regret", "regret", "By how much the oracle's return is higher"),
         *_estimated("skill", "skill", "Accuracy of the predictions above the base rate"),
     ]
-    points = adaptation_points(rows)
     ends = {min(point.steps for point in points), max(point.steps for point in points)}
     table = [
         {
@@ -88,7 +88,7 @@ def _adaptation(path: Path, name: str) -> list[Any]:
     known = {key for row in table for key, value in row.items() if value is not None}
     shown = [column for column in columns if column.key in known]
     return [
-        adaptation_sentences(rows),
+        adaptation_sentences(rows, points),
         figures,
         Table(name, "The curve of adapting, and both of its ends of each partner", shown, table),
     ]
