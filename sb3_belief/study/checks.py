@@ -164,8 +164,8 @@ def _check_environment(study: Study, configs: dict[str, RunConfig]) -> None:
     tried: list[tuple[Any, TeamVecEnv]] = []
     seed = env_seed(study.seeds[0])
     with ExitStack() as stack:
-        for arm, config in configs.items():
-            where = study.arms[arm].where
+        for arm, unseeded in configs.items():
+            config, where = study.seeded(unseeded, study.seeds[0]), study.arms[arm].where
             check_copies(config.n_envs, study.train.get("vec_env", "dummy"), config.origin("n_envs"))
             check_copies(study.evaluation.copies, "dummy", f"{study.source}: evaluation: copies")
             check_optimizers(config, "cpu")

@@ -6,21 +6,21 @@ It is data like every configuration here. What each key means is in docs/studies
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from sb3_belief.study.yaml_rows import Section, read_sections
 from sb3_belief.zoo.config import RunConfig, load_config
 from sb3_belief.zoo.durations import DURATION, seconds_of
-from sb3_belief.zoo.errors import short
+from sb3_belief.zoo.errors import ConfigError, short
 from sb3_belief.zoo.names import ALGOS, load_env
 from sb3_belief.zoo.run_folder import folder_name
 
 _MOST, _MOST_SEED, _MOST_SEEDS, _MOST_JOBS = 10**15, 2**31 - 1, 10_000, 1024
 _KEYS = (
     *("name", "environments", "algorithms", "seeds", "n_timesteps", "evaluation"),
-    *("baseline", "ablations", "exclude", "train"),
+    *("baseline", "ablations", "exclude", "train", "seed_env_kwarg"),
 )
 _EVALUATION = ("every", "episodes", "copies", "final_episodes", "online")
 #: The options of ``train`` that a study may set, without those that it sets itself
@@ -99,6 +99,8 @@ class Study:
     :param ablations: Labels by title of a panel
     :param excluded: Pairs of a label and an environment that are left out
     :param train: Options of ``train``
+    :param seed_env_kwarg: Argument of the environments that gets the seed of the run, or None. An environment that draws
+        others of its own from a seed that is an argument would otherwise draw the same ones in all runs
     """
 
     name: str
@@ -112,6 +114,7 @@ class Study:
     ablations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     excluded: frozenset[tuple[str, str]] = frozenset()
     train: Mapping[str, Any] = field(default_factory=dict)
+    seed_env_kwarg: str | None = None
 
     def pairs(self) -> list[tuple[str, str]]:
         """Return the pairs of a label and an environment that are trained, each with every seed."""
@@ -141,7 +144,32 @@ class Study:
         """
         place = self.places[env_id]
         load_env(env_id, place.where.removesuffix(f": {env_id}"), extra_packages)
-        return load_config(self.arms[arm].algo, env_id, extra_packages=extra_packages, overrides=self.overrides(arm, env_id))
+        config = load_config(self.arms[arm].algo, env_id, extra_packages=extra_packages, overrides=self.overrides(arm, env_id))
+        taken = config.env_kwargs.keys() | config.eval_env_kwargs.keys()
+        if self.seed_env_kwarg in taken:
+            raise ConfigError(
+                f"{self.source}: seed_env_kwarg: {self.seed_env_kwarg!r} is set by env_kwargs of {arm!r} in {env_id!r}"
+                " already: leave one of them out."
+            )
+        return config
+
+    def seeded(self, config: RunConfig, seed: int) -> RunConfig:
+        """
+        Return the configuration of the run with a seed.
+
+        :param config: That of its pair
+        :param seed: Seed of the run
+        :return: The configuration, in which the environment gets the seed too if the study says so
+        """
+        if self.seed_env_kwarg is None:
+            return config
+        env_kwargs = {**config.env_kwargs, self.seed_env_kwarg: seed}
+        return replace(
+            config,
+            env_kwargs=env_kwargs,
+            settings={**config.settings, "env_kwargs": env_kwargs},
+            origins={**config.origins, self.seed_env_kwarg: f"{self.source}: seed_env_kwarg"},
+        )
 
     def to_data(self) -> dict[str, Any]:
         """
@@ -162,6 +190,7 @@ class Study:
             "ablations": {title: list(arms) for title, arms in self.ablations.items()},
             "exclude": [{"arm": arm, "environment": env_id} for arm, env_id in sorted(self.excluded)],
             "train": dict(self.train),
+            "seed_env_kwarg": self.seed_env_kwarg,
         }
         return {key: value for key, value in data.items() if value not in (None, {}, [])}
 
@@ -193,6 +222,7 @@ def load_study(path: Path) -> Study:
         ablations=_ablations(top["ablations"], arms) if "ablations" in top else {},
         excluded=_excluded(top["exclude"], arms, places) if "exclude" in top else frozenset(),
         train=_train_options(top["train"]) if "train" in top else {},
+        seed_env_kwarg=_argument(top["seed_env_kwarg"]) if "seed_env_kwarg" in top else None,
     )
     if not study.pairs():
         raise top.error("exclude leaves nothing to train.")
@@ -315,6 +345,12 @@ def _train_options(section: Section) -> dict[str, Any]:
             "an environment in the run's process cannot be ended while it hangs: vec_env: subproc."
         )
     return options
+
+
+def _argument(section: Section) -> str:
+    if not isinstance(section.value, str) or not section.value.isidentifier():
+        raise section.error(f"must be the name of an argument of the environments, not {short(section.value)}.")
+    return section.value
 
 
 def _duration(section: Section) -> float:

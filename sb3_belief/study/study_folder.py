@@ -46,7 +46,7 @@ def planned_cells(study: Study, folder: Path, configs: dict[tuple[str, str], Run
     planned = []
     for seed in study.seeds:
         for arm, env_id in study.pairs():
-            config = configs[arm, env_id]
+            config = study.seeded(configs[arm, env_id], seed)
             place = folder / CELLS / arm / folder_name(env_id) / f"seed_{seed}"
             record = {
                 "study": study.name,

@@ -8,6 +8,7 @@ import yaml
 from sb3_belief.cli.main import main
 from sb3_belief.study.checks import check_study
 from sb3_belief.study.specification import load_study
+from sb3_belief.study.study_folder import planned_cells
 from sb3_belief.zoo.errors import ConfigError
 from tests.study.tiny import EASY, TINY, write
 
@@ -142,3 +143,40 @@ def test_aliases_and_merges_keep_their_lines(tmp_path):
     text = yaml.safe_dump(TINY, sort_keys=False)
     study = read(tmp_path, text.replace("algorithms:\n", "algorithms:\n  a: &a {algo: ppo}\n  b: *a\n"))
     assert study.arms["b"].algo == "ppo" and "line" in study.arms["b"].where
+
+
+SEEDED = """\
+environments: [aisle-sides]
+algorithms:
+  ippo:
+  told: {algo: ippo, params: {env_kwargs: {reveal_partner: true}}}
+seeds: [3, 5]
+seed_env_kwarg: partner_seed
+"""
+
+
+def test_each_seed_meets_others(tmp_path):
+    study = read(tmp_path, SEEDED)
+    assert read(tmp_path, yaml.safe_dump(study.to_data())).seed_env_kwarg == "partner_seed"
+    checked = check_study(study, tmp_path / "logs")
+    planned = planned_cells(study, tmp_path / "logs", checked.configs)
+    assert [(each.record["arm"], each.record["settings"]["env_kwargs"]) for each in planned] == [
+        ("ippo", {"partner_seed": 3}),
+        ("told", {"reveal_partner": True, "partner_seed": 3}),
+        ("ippo", {"partner_seed": 5}),
+        ("told", {"reveal_partner": True, "partner_seed": 5}),
+    ]
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("7", "seed_env_kwarg: must be the name of an argument of the environments, not 7"),
+        ("reveal_partner", "seed_env_kwarg: 'reveal_partner' is set by env_kwargs of 'told' in 'aisle-sides' already"),
+        ("partner_sed", "seed_env_kwarg: aisle-sides refuses its settings: .*unexpected keyword argument 'partner_sed'"),
+    ],
+)
+def test_an_argument_for_the_seed_that_does_not_fit(tmp_path, name, message):
+    with pytest.raises(ConfigError, match=message):
+        check_study(read(tmp_path, SEEDED.replace("partner_seed", name)), tmp_path / "logs")
+    assert not (tmp_path / "logs").exists()
