@@ -24,6 +24,7 @@ class AisleConfig(TypeRules):
     :param traffic: Probability in (0, 1] that another robot enters an aisle that has none, per step
     :param jam_steps: Steps that a wrong guess costs both robots, >= 1
     :param max_steps: Length of an episode in steps, >= 1
+    :param others_visible: Whether a robot observes what the one in sight does; False as a control
     :raises ValueError: For any other value, and for ``held_out`` where no convention is held out
     """
 
@@ -34,6 +35,7 @@ class AisleConfig(TypeRules):
     traffic: float = 0.7
     jam_steps: int = 8
     max_steps: int = 40
+    others_visible: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,6 +48,8 @@ class AisleConfig(TypeRules):
         is_number = isinstance(self.traffic, int | float) and not isinstance(self.traffic, bool)
         if not is_number or not 0 < self.traffic <= 1:
             raise ValueError(f"traffic={self.traffic!r} must be a probability in (0, 1], per step and empty aisle.")
+        if not isinstance(self.others_visible, bool):
+            raise ValueError(f"others_visible={self.others_visible!r} must be True or False.")
         if self.held_out and not held_out_conventions(self.kinds).any():
             raise ValueError(f"held_out=True needs kinds >= 3, since fewer have no held-out conventions; kinds={self.kinds}.")
 

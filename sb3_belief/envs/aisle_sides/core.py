@@ -105,7 +105,7 @@ class AisleCore:
         :return: Rewards, float32 [n_copies, n_robots], and whether the step limit is reached, bool [n_copies]
         """
         rules, facing = self.config, self.facing
-        self.saw = self.in_sight
+        self.saw = self.in_sight & rules.others_visible
         side = self.sides[self.types.current[:, None], self.kind]
         meets = facing & (actions != MIDDLE)
         self.action, self.other_action = actions, np.where(meets, side, MIDDLE)

@@ -54,6 +54,8 @@ class AisleSides(TeamGame[np.ndarray, int]):
         while the learner is too far away to see it
     :param jam_steps: Steps that a wrong guess costs both robots, >= 1
     :param max_steps: Length of an episode in steps, >= 1
+    :param others_visible: Whether a robot observes what the one in sight does. False as a control, in which a belief has nothing
+        to learn from
     :param redraw_every: Number of rollouts or episodes for which a convention is valid, >= 1. None for one that never changes
     :param redraw_unit: ``"rollouts"`` or ``"episodes"``
     :param per_copy: Whether each copy draws a convention by itself; False for the same in all copies
@@ -82,6 +84,7 @@ class AisleSides(TeamGame[np.ndarray, int]):
         traffic: float = 0.7,
         jam_steps: int = 8,
         max_steps: int = 40,
+        others_visible: bool = True,
         redraw_every: int | None = 5,
         redraw_unit: str = "rollouts",
         per_copy: bool = False,
@@ -107,6 +110,7 @@ class AisleSides(TeamGame[np.ndarray, int]):
             traffic=traffic,
             jam_steps=jam_steps,
             max_steps=max_steps,
+            others_visible=others_visible,
         )
         self.core = AisleCore(1, self.config)
         self.possible_agents, others = robot_names(self.config)

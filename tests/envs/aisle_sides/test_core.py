@@ -77,6 +77,13 @@ def test_robots_further_apart_drive_towards_each_other_in_the_middle():
     assert core.saw.all() and core.facing.all() and core.other_action[0, 0] == MIDDLE
 
 
+def test_what_others_do_can_be_hidden_and_changes_nothing_else():
+    seen, hidden = scene(2, 3), scene(2, 3, others_visible=False)
+    assert do(seen, LEFT) == do(hidden, LEFT)
+    assert seen.saw.all() and not hidden.saw.any()
+    np.testing.assert_array_equal(seen.observe(), hidden.observe())
+
+
 @pytest.mark.parametrize("position, enters", [(0, True), (3, False), (7, True)])
 def test_a_robot_enters_where_it_is_not_seen_yet(position, enters):
     core = scene(position, kinds=4)

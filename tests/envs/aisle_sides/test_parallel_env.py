@@ -112,6 +112,7 @@ def test_a_reset_with_a_seed_starts_the_sequence_of_conventions_anew():
         ({"traffic": True}, "traffic=True must be a probability"),
         ({"jam_steps": 0}, "jam_steps=0 must be an integer >= 1"),
         ({"max_steps": 2.0}, "max_steps=2.0 must be an integer >= 1"),
+        ({"others_visible": 1}, "others_visible=1 must be True or False"),
         ({"redraw_every": 0}, "every=0 must be an integer >= 1"),
         ({"held_out": True, "kinds": 2}, "held_out=True needs kinds >= 3"),
         ({"render_mode": "human"}, "render_mode='human' is not one of"),
