@@ -14,7 +14,8 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yml"))
 
 
 def test_all_are_there():
-    assert NAMES == ["ablations", "convention", "lbf", "smac_paper", "smax", "speaker_listener", "traffic_junction"]
+    aisles = ["aisle_sides", "aisle_sides_each_rollout", "aisle_sides_stationary", "aisle_sides_unseen"]
+    assert NAMES == ["ablations", *aisles, "convention", "lbf", "smac_paper", "smax", "speaker_listener", "traffic_junction"]
 
 
 @pytest.mark.parametrize("name", NAMES)
