@@ -15,7 +15,17 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yml"))
 
 def test_all_are_there():
     aisles = ["aisle_sides", "aisle_sides_each_rollout", "aisle_sides_stationary", "aisle_sides_unseen"]
-    assert NAMES == ["ablations", *aisles, "convention", "lbf", "smac_paper", "smax", "speaker_listener", "traffic_junction"]
+    assert NAMES == [
+        "ablations",
+        *aisles,
+        "changing_teammates_gate",
+        "convention",
+        "lbf",
+        "smac_paper",
+        "smax",
+        "speaker_listener",
+        "traffic_junction",
+    ]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -28,7 +38,7 @@ def test_a_dry_run_of_each(name, tmp_path, capsys):
         # Never for another reason than an environment that is not here, and then all others have been checked
         assert status == 2 and "which is not installed" in captured.err
         assert captured.err.endswith("All that does not need it has been checked.\n")
-        assert name in ("lbf", "smac_paper", "smax", "speaker_listener")
+        assert name in ("changing_teammates_gate", "lbf", "smac_paper", "smax", "speaker_listener")
     assert not list(tmp_path.iterdir())
 
 
