@@ -29,6 +29,8 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
         most frequent action (for one-hot actions: Discrete, MultiDiscrete);
         ``history_gain``, how much the action loss rises when the history's actions are shuffled across its rows (0 while
         the history is empty, and for a belief without one);
+        ``history_gain_rare``, the same over those visible others alone who did something else than what each does most often,
+        where actions are discrete (issue 19). Where a type shows in a few steps only, the mean over all of them hides it;
         ``attention_entropy``, of the attention weights, in nats, at most log N_h;
         ``fusion_ratio``, weight of the belief where policy and value fuse it, in [0, 1] (Fig. 5e);
         ``visible_fraction``, share of the others that are visible;
@@ -62,10 +64,16 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     if output.prediction is None:
         return measured
     measured["action_loss"] = float(policy.action_error(output.prediction, minibatch))
+    if policy.layout.blocks:
+        measured["history_gain_rare"] = 0.0
     if policy.history is not None and policy.history.valid.any():
         with_shuffled = policy.history._replace(actions=_shuffled(policy.history.actions, policy.history.valid))
         shuffled = belief(flat, with_shuffled, minibatch.noise, minibatch.selected)
         measured["history_gain"] = float(policy.action_error(shuffled.prediction, minibatch)) - measured["action_loss"]
+        if policy.layout.blocks:
+            rare = minibatch._replace(others_visible=_did_the_rare(minibatch, policy.layout))
+            errors = [float(policy.action_error(each, rare)) for each in (shuffled.prediction, output.prediction)]
+            measured["history_gain_rare"] = errors[0] - errors[1]
     accuracy, base_rate = _accuracies(output.prediction, minibatch, policy.layout)
     if not math.isnan(accuracy):
         measured["accuracy"], measured["base_rate"] = accuracy, base_rate
@@ -98,6 +106,16 @@ def _first_log_ratio(
         masks["action_masks"] = buffer.to_torch(buffer.action_masks[step])
     _, log_prob, _ = policy.evaluate_actions(attach(observations, minibatch), actions, **masks)
     return float((log_prob - buffer.to_torch(buffer.log_probs[step]).flatten()).abs().max())
+
+
+def _did_the_rare(minibatch: BeliefMinibatch, layout: ActionLayout) -> th.Tensor:
+    """Return who was visible and did something else than what each does most often, bool ``[B, n_others]``."""
+    rare = th.zeros_like(minibatch.others_visible)
+    for owner, start, width in layout.blocks:
+        visible = minibatch.others_visible[:, owner]
+        taken = minibatch.others_actions[:, start : start + width].argmax(dim=1)
+        rare[:, owner] |= visible & (taken != taken[visible].bincount(minlength=width).argmax())
+    return rare
 
 
 def _accuracies(prediction: th.Tensor, minibatch: BeliefMinibatch, layout: ActionLayout) -> tuple[float, float]:

@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
+import torch as th
 
-from sb3_belief.belief_ppo import algorithm
+from sb3_belief import Team, make_team_env
+from sb3_belief.belief.layout import ActionLayout
+from sb3_belief.belief_ppo import algorithm, diagnostics
+from sb3_belief.belief_ppo.buffers import BeliefMinibatch
+from sb3_belief.zoo.config import load_config
 from tests.belief_ppo.helpers import EVERY, ROLLOUT, make_model, same_parameters
 
 ALWAYS = {"visible_fraction", "fusion_ratio", "first_log_ratio", "history_gain"}
-PREDICTING = {"action_loss", "accuracy", "base_rate"}
+PREDICTING = {"action_loss", "accuracy", "base_rate", "history_gain_rare"}
 NAMES = {
     "dynamic": ALWAYS | PREDICTING | {"kl", "attention_entropy"},
     "context": ALWAYS | PREDICTING | {"attention_entropy"},
@@ -28,7 +33,7 @@ def test_diagnostics_measure_what_they_say():
     model.learn(3 * 300)
     measured = measured_of(model)
     assert set(measured) == {
-        *("action_loss", "kl", "accuracy", "base_rate", "history_gain"),
+        *("action_loss", "kl", "accuracy", "base_rate", "history_gain", "history_gain_rare"),
         *("attention_entropy", "fusion_ratio", "visible_fraction", "first_log_ratio"),
     }
     # The others act at random: 3 and 4 actions, seen six times out of ten, nothing to predict
@@ -55,6 +60,7 @@ def test_each_variant_logs_what_it_has(belief, kind):
         # By construction, not by luck: nothing of a history that is not there can be shuffled
         without_history = belief not in ("dynamic", "context") or iteration == 0
         assert (measured["history_gain"] == 0) == without_history
+        assert (measured.get("history_gain_rare", 0.0) == 0) == without_history
         if "attention_entropy" in measured:
             assert (measured["attention_entropy"] == 0) == (iteration == 0)
         assert measured["first_log_ratio"] < 1e-5
@@ -82,3 +88,32 @@ def test_measuring_changes_nothing(monkeypatch):
     unmeasured = make_model().learn(3 * ROLLOUT)
     assert measured_of(measured) and not measured_of(unmeasured)
     assert same_parameters(measured, unmeasured)
+
+
+def test_who_did_something_rare():
+    layout = ActionLayout([[3], [2, 2], [1]], ["categorical", "categorical", "number"])
+    a = np.eye(3)[[0, 0, 1, 2, 2]]
+    # The first component is 0 but once, the second 1 but once
+    b = np.concatenate([np.eye(2)[[0, 0, 1, 0, 0]], np.eye(2)[[1, 0, 1, 1, 1]]], axis=1)
+    actions = th.as_tensor(np.concatenate([a, b, np.zeros((5, 1))], axis=1), dtype=th.float32)
+    visible = th.tensor([[True, True, True]] * 4 + [[False, True, True]])
+    minibatch = BeliefMinibatch(th.zeros(5, 0), th.zeros(5, 0, dtype=th.long), actions, visible)
+    rare = diagnostics._did_the_rare(minibatch, layout)
+    # What nobody saw does not count, or 2 would be as frequent as 0 with a; numbers are neither frequent nor rare
+    assert rare.tolist() == [
+        [False, False, False],
+        [False, True, False],
+        [True, True, False],
+        [True, False, False],
+        [False, False, False],
+    ]
+
+
+def test_a_type_that_shows_in_a_few_steps_shows_in_those():
+    env = make_team_env("aisle-sides", n_envs=20, seed=1)
+    config = load_config("belief_ppo", "aisle-sides")
+    team = Team(config.algo_class, config.policy, env, seed=1, **config.algo_kwargs).learn(20 * 800)
+    measured = measured_of(team.agents["robot_0"])
+    # The others are in the middle of the aisle in nine steps out of ten, whatever the convention is
+    assert measured["base_rate"] > 0.75
+    assert measured["history_gain_rare"] > 3 * measured["history_gain"] > 0

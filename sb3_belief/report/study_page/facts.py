@@ -17,6 +17,10 @@ DIAGNOSTICS = {
         "Gain by the history",
         "how much the loss of the predictions rises when the history's actions are shuffled",
     ),
+    "belief/history_gain_rare": (
+        "Gain by the history, rare actions",
+        "the same over the actions that each other does not do most often",
+    ),
     "belief/action_loss": ("Loss of the predictions", "loss of the predicted actions"),
     "belief/kl": ("KL divergence", "divergence of the latent variable from its prior"),
     "belief/attention_entropy": (
