@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path, positive_number, seed_number, whole_number
-from sb3_belief.cli.flags import add_common, add_saved_team
+from sb3_belief.cli.flags import add_common, add_saved_team, compute_with_one_thread
 
 HELP = "measure how a trained team adapts to partners that it has not met"
 
@@ -58,6 +58,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.errors import ConfigError
 
+    compute_with_one_thread()
     try:
         from sb3_belief.study.adaptation import CHECKPOINTS, AdaptOptions, adapt
         from sb3_belief.study.meetings import Play

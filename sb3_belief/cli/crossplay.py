@@ -4,7 +4,7 @@ import argparse
 
 from sb3_belief.cli.adapt import add_play
 from sb3_belief.cli.flag_types import filled_text, new_path, whole_number
-from sb3_belief.cli.flags import add_common
+from sb3_belief.cli.flags import add_common, compute_with_one_thread
 
 HELP = "measure agents of each run among the agents of each other"
 
@@ -36,6 +36,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.errors import ConfigError
 
+    compute_with_one_thread()
     try:
         from sb3_belief.study.crossplay import CrossplayOptions, crossplay
         from sb3_belief.study.meetings import Play

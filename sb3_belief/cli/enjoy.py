@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import frame_rate, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common, add_partners, add_saved_team
+from sb3_belief.cli.flags import add_common, add_partners, add_saved_team, compute_with_one_thread
 
 HELP = "replay a trained team"
 
@@ -45,6 +45,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
+    compute_with_one_thread()
     names = "run env partners trust episodes n_timesteps deterministic seed output fps device observe"
     enjoy(
         EnjoyOptions(

@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common, add_saved_team
+from sb3_belief.cli.flags import add_common, add_saved_team, compute_with_one_thread
 
 HELP = "show what the agents of a trained team believe of each other"
 
@@ -36,6 +36,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.zoo.watch import WatchOptions, watch
 
+    compute_with_one_thread()
     names = "run env trust episodes seed agent output device"
     watch(
         WatchOptions(

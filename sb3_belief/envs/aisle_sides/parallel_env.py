@@ -54,8 +54,8 @@ class AisleSides(TeamGame[np.ndarray, int]):
         while the learner is too far away to see it
     :param jam_steps: Steps that a wrong guess costs both robots, >= 1
     :param max_steps: Length of an episode in steps, >= 1
-    :param others_visible: Whether a robot observes what the one in sight does. False as a control, in which a belief has nothing
-        to learn from
+    :param others_visible: Whether a robot observes what the one in sight does. False as a control, in which a belief has
+        nothing to learn from
     :param redraw_every: Number of rollouts or episodes for which a convention is valid, >= 1. None for one that never changes
     :param redraw_unit: ``"rollouts"`` or ``"episodes"``
     :param per_copy: Whether each copy draws a convention by itself; False for the same in all copies
