@@ -1,8 +1,6 @@
 """
 Train the full YAML entry of an environment with several beliefs and seeds, and compare the final teams.
 
-    python -m studies.learning --env traffic-junction-medium --beliefs dynamic none --seeds 0 1 2
-    python -m studies.learning --env lbf/Foraging-2s-8x8-2p-2f-coop-v3 --plot lbf.png
     python -m studies.learning --algo maskable_belief_ppo --env smax/3m --quantity success --plot 3m.png
 
 prints a row for each run: the joint steps; return and success rate over 1,024 episodes that the training did not use, with
