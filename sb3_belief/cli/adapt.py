@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path, positive_number, seed_number, whole_number
-from sb3_belief.cli.flags import add_common, add_saved_team, compute_with_one_thread
+from sb3_belief.cli.flags import add_common, add_saved_team
 
 HELP = "measure how a trained team adapts to partners that it has not met"
 
@@ -56,9 +56,10 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     :param _: The words of the command line, unused
     :return: Exit status
     """
+    from sb3_belief.common.threads import use_threads
     from sb3_belief.zoo.errors import ConfigError
 
-    compute_with_one_thread()
+    use_threads(1)
     try:
         from sb3_belief.study.adaptation import CHECKPOINTS, AdaptOptions, adapt
         from sb3_belief.study.meetings import Play

@@ -4,7 +4,7 @@ import argparse
 
 from sb3_belief.cli.adapt import add_play
 from sb3_belief.cli.flag_types import filled_text, new_path, whole_number
-from sb3_belief.cli.flags import add_common, compute_with_one_thread
+from sb3_belief.cli.flags import add_common
 
 HELP = "measure agents of each run among the agents of each other"
 
@@ -34,9 +34,10 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     :param _: The words of the command line, unused
     :return: Exit status
     """
+    from sb3_belief.common.threads import use_threads
     from sb3_belief.zoo.errors import ConfigError
 
-    compute_with_one_thread()
+    use_threads(1)
     try:
         from sb3_belief.study.crossplay import CrossplayOptions, crossplay
         from sb3_belief.study.meetings import Play

@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import frame_rate, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common, add_partners, add_saved_team, compute_with_one_thread
+from sb3_belief.cli.flags import add_common, add_partners, add_saved_team
 
 HELP = "replay a trained team"
 
@@ -43,9 +43,10 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     :param _: The words of the command line, unused
     :return: Exit status
     """
+    from sb3_belief.common.threads import use_threads
     from sb3_belief.zoo.enjoy import EnjoyOptions, enjoy
 
-    compute_with_one_thread()
+    use_threads(1)
     names = "run env partners trust episodes n_timesteps deterministic seed output fps device observe"
     enjoy(
         EnjoyOptions(

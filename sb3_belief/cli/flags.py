@@ -111,15 +111,3 @@ class Parser(argparse.ArgumentParser):
         :param message: Why
         """
         self.exit(2, f"Refused: {message}. See {self.prog} --help.\n")
-
-
-def compute_with_one_thread() -> None:
-    """
-    Have torch compute with one thread, as a training does by default.
-
-    The networks are small, and threads that wait for each other cost more than they compute: on two busy cores a short
-    ``adapt`` took 58 s with two threads and 11 s with one.
-    """
-    import torch as th
-
-    th.set_num_threads(1)

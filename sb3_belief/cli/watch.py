@@ -3,7 +3,7 @@
 import argparse
 
 from sb3_belief.cli.flag_types import filled_text, new_path, positive_number, seed_number
-from sb3_belief.cli.flags import add_common, add_saved_team, compute_with_one_thread
+from sb3_belief.cli.flags import add_common, add_saved_team
 
 HELP = "show what the agents of a trained team believe of each other"
 
@@ -34,9 +34,10 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     :param _: The words of the command line, unused
     :return: Exit status
     """
+    from sb3_belief.common.threads import use_threads
     from sb3_belief.zoo.watch import WatchOptions, watch
 
-    compute_with_one_thread()
+    use_threads(1)
     names = "run env trust episodes seed agent output device"
     watch(
         WatchOptions(

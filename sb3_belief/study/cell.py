@@ -125,6 +125,7 @@ def _train_and_evaluate(cell: Cell, record: dict[str, Any], extra_packages: tupl
     """Return the exit status, and what comes into the record."""
     import pyarrow as pa
 
+    from sb3_belief.common.threads import use_threads
     from sb3_belief.report.episodes import EPISODES, write_episodes_table
     from sb3_belief.study.final_evaluation import episode_rows
     from sb3_belief.zoo.config import load_config
@@ -133,6 +134,8 @@ def _train_and_evaluate(cell: Cell, record: dict[str, Any], extra_packages: tupl
     status, run = _train(cell, record, config, extra_packages)
     if status:
         return status, {}
+    # A run that had finished before has not set them
+    use_threads(record["options"]["num_threads"])
     rows = episode_rows(record, config, run, extra_packages)
     write_episodes_table(pa.Table.from_pylist(rows, schema=EPISODES), cell.episodes)
     return 0, {"run": run.relative_to(cell.folder).as_posix()}

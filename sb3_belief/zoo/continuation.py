@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_belief.common.durable_files import sweep_temporary_files
 from sb3_belief.common.safe_files.trust import Trust
+from sb3_belief.common.threads import use_threads
 from sb3_belief.common.versions import versions
 from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.zoo.config import RunConfig, load_config
@@ -136,8 +137,7 @@ def _go_on(
         n_timesteps=total - before["start_timesteps"],
         run_folder=None if asked.trust else folder,
     )
-    if options.num_threads > 0:
-        th.set_num_threads(options.num_threads)
+    use_threads(options.num_threads)
     env, eval_env = make_envs(config, options, stack)
     for each in (folder, folder / CHECKPOINTS, *folder.glob("agents/*")):
         sweep_temporary_files(each)

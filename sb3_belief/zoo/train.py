@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief.common.safe_files.trust import Trust
+from sb3_belief.common.threads import use_threads
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.vec_env.observe_last import with_last_step
@@ -58,8 +59,7 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
     _check_options(config, options)
     seed = int(np.random.SeedSequence().generate_state(1)[0] % 2**31) if options.seed is None else options.seed
     options = replace(options, seed=seed)
-    if options.num_threads > 0:
-        th.set_num_threads(options.num_threads)
+    use_threads(options.num_threads)
 
     with ExitStack() as stack:
         signals = stack.enter_context(EndSignals())
