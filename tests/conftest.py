@@ -8,7 +8,7 @@ import torch as th
 # The networks are small, and results must not depend on the machine's cores
 th.set_num_threads(1)
 # Under nohup this process would ignore the signal, and so would those that tests start and send it to
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Worker processes start from a server that has imported what they need: a tenth of a second each instead of seconds
 multiprocessing.set_forkserver_preload(["tests.team.toy_envs", "sb3_belief.team", "mpe2.simple_spread_v3"])
