@@ -15,3 +15,15 @@ def check_integer(name: str, value: object, least: int, meaning: str, most: int 
     if not isinstance(value, int) or isinstance(value, bool) or value < least or (most is not None and value > most):
         allowed = f">= {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"{name}={value!r} must be an integer {allowed}: {meaning}.")
+
+
+def check_flag(name: str, value: object) -> None:
+    """
+    Check an argument that is True or False.
+
+    :param name: Name of the argument
+    :param value: What the user gave
+    :raises ValueError: If it is neither
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}={value!r} must be True or False.")

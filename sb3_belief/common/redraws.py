@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from sb3_belief.common.checks import check_integer
+from sb3_belief.common.checks import check_flag, check_integer
 
 UNITS = ("rollouts", "episodes")
 
@@ -39,8 +39,7 @@ class RedrawSchedule:
         check_integer("seed", self.seed, 0, "which decides who is drawn")
         if self.unit not in UNITS:
             raise ValueError(f"unit={self.unit!r} is not one of {', '.join(map(repr, UNITS))}.")
-        if not isinstance(self.per_copy, bool):
-            raise ValueError(f"per_copy={self.per_copy!r} must be True or False.")
+        check_flag("per_copy", self.per_copy)
         if self.unit == "episodes" and not self.per_copy and self.every is not None:
             raise ValueError(
                 "unit='episodes' needs per_copy=True, since the copies end their episodes at different times; partners that"

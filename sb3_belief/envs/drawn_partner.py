@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_belief.common.checks import check_flag
 from sb3_belief.common.redraws import RedrawSchedule
 
 
@@ -47,8 +48,7 @@ class DrawnPartner:
                 f"rollout_steps={rollout_steps!r} must be an integer >= 1, the learner's n_steps: with redraw_unit='rollouts'"
                 " it says how many steps of a copy are a rollout. Without rollouts it may be None."
             )
-        if not isinstance(reveal, bool):
-            raise ValueError(f"reveal_partner={reveal!r} must be True or False.")
+        check_flag("reveal_partner", reveal)
         self._reveal = reveal
         self._begin(None)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.common.checks import check_integer
+from sb3_belief.common.checks import check_flag, check_integer
 from sb3_belief.common.redraws import RedrawSchedule
 
 
@@ -36,8 +36,7 @@ class TypeRules:
     def __post_init__(self) -> None:
         check_integer("rollout_steps", self.rollout_steps, 1, "the n_steps of the learner")
         for name in ("held_out", "reveal_partner"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}={getattr(self, name)!r} must be True or False.")
+            check_flag(name, getattr(self, name))
         try:
             self.schedule  # noqa: B018
         except ValueError as error:

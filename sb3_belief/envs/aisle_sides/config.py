@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from sb3_belief.common.checks import check_integer
+from sb3_belief.common.checks import check_flag, check_integer
 from sb3_belief.envs.drawn_types import TypeRules
 
 MIDDLE, LEFT, RIGHT = 0, 1, 2
@@ -48,8 +48,7 @@ class AisleConfig(TypeRules):
         is_number = isinstance(self.traffic, int | float) and not isinstance(self.traffic, bool)
         if not is_number or not 0 < self.traffic <= 1:
             raise ValueError(f"traffic={self.traffic!r} must be a probability in (0, 1], per step and empty aisle.")
-        if not isinstance(self.others_visible, bool):
-            raise ValueError(f"others_visible={self.others_visible!r} must be True or False.")
+        check_flag("others_visible", self.others_visible)
         if self.held_out and not held_out_conventions(self.kinds).any():
             raise ValueError(f"held_out=True needs kinds >= 3, since fewer have no held-out conventions; kinds={self.kinds}.")
 

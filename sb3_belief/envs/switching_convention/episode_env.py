@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from sb3_belief.common.checks import check_flag
 from sb3_belief.envs.drawn_partner import partner_schedule
 from sb3_belief.envs.switching_convention.parallel_env import FOLLOWER, SwitchingConvention
 from sb3_belief.envs.switching_convention.vec_env import SwitchingConventionVecEnv
@@ -40,8 +41,7 @@ def _told(cues: np.ndarray, conventions: np.ndarray) -> np.ndarray:
 
 
 def _observation_space(m: int, reveal_partner: bool) -> spaces.Space:
-    if not isinstance(reveal_partner, bool):
-        raise ValueError(f"reveal_partner={reveal_partner!r} must be True or False.")
+    check_flag("reveal_partner", reveal_partner)
     if not reveal_partner:
         return spaces.Discrete(m)
     if m > _MOST_REVEALED:

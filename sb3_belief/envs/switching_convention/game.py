@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_belief.common.checks import check_integer
+from sb3_belief.common.checks import check_flag, check_integer
 from sb3_belief.common.redraws import RedrawSchedule
 from sb3_belief.envs.base import check_same_arguments
 
@@ -57,8 +57,7 @@ class ConventionConfig:
                 "rewarded='last' with K=None would never reward: a convention that never changes has no last rollout."
                 " Give K a number, or use rewarded='always'."
             )
-        if not isinstance(self.leader_visible, bool):
-            raise ValueError(f"leader_visible={self.leader_visible!r} must be True or False.")
+        check_flag("leader_visible", self.leader_visible)
         # Which checks the rest
         _ = self.schedule
 

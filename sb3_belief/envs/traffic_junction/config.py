@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from sb3_belief.common.checks import check_flag
 from sb3_belief.envs.traffic_junction.layout import LEVELS, Level
 
 ORDERS = ("commnet", "ic3net")
@@ -48,8 +49,7 @@ class JunctionConfig:
             raise ValueError(f"reward_scale={self.reward_scale!r} must be a positive number (0.1 suits PPO).")
         if not isinstance(self.vision, int) or isinstance(self.vision, bool) or self.vision < 0:
             raise ValueError(f"vision={self.vision!r} must be an integer >= 0 (1 shows the 3x3 cells around a car).")
-        if not isinstance(self.observe_last_actions, bool):
-            raise ValueError(f"observe_last_actions={self.observe_last_actions!r} must be True or False.")
+        check_flag("observe_last_actions", self.observe_last_actions)
 
     @property
     def level_spec(self) -> Level:
