@@ -79,7 +79,7 @@ bench-peers: $(STAMP)  ## compare with other libraries (an environment for each:
 $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
 	$(PYTHON) -m venv $(SMAX_VENV)
 	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt torch
-	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt -e . pytest jaxmarl 'gymnasium<1.4'
+	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt -e '.[study]' pytest jaxmarl 'gymnasium<1.4'
 	@touch $@
 
 test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from its package

@@ -21,6 +21,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         type=process_number,
         help="number of runs at the same time, a process each (default: 1; with --engine ray as many as there is room for)",
     )
+    parser.add_argument(
+        "--envs", nargs="+", type=filled_text, metavar="ID", help="start the runs in these environments of the study only"
+    )
     parser.add_argument("--retry", action="store_true", help="start the runs again that failed")
     parser.add_argument("--dry-run", action="store_true", help="check everything, show the runs, and write nothing")
     parser.add_argument(
@@ -45,7 +48,7 @@ def run(args: argparse.Namespace, _: list[str]) -> int:
     """
     from sb3_belief.study.run_study import StudyOptions, run_study
 
-    names = "file log_folder jobs retry dry_run engine address"
+    names = "file log_folder jobs envs retry dry_run engine address"
     return run_study(
         StudyOptions(**{name: getattr(args, name) for name in names.split()}, extra_packages=tuple(args.allow_package))
     )

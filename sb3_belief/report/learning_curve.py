@@ -130,67 +130,22 @@ def read_episodes(folder: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarra
     return steps, returns, successes
 
 
-def check_quantity(quantity: str) -> None:
+def binned(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """
-    Check the name of what a curve shows.
+    Return the mean value of the episodes that ended in each bin of joint steps.
 
-    :param quantity: ``"return"`` or ``"success"``
-    :raises ValueError: For another name
+    :param steps: Joint steps after which each episode ended, ``[k]``
+    :param values: Values of these episodes, ``[k]``
+    :param edges: Edges of the bins in ascending order, ``[n + 1]``. A bin includes its right edge
+    :return: Mean of each bin, ``[n]``. NaN for a bin in which no episode ended
     """
-    if quantity not in QUANTITIES:
-        raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
-
-
-def no_successes(folder: str | os.PathLike[str]) -> ValueError:
-    """
-    Return the error for successes that a run does not report.
-
-    :param folder: Folder of the run
-    :return: The error to raise
-    """
-    return ValueError(f"{os.fspath(folder)!r} reports no successes; draw quantity='return'.")
-
-
-def new_axes(title: str, quantity: str) -> tuple[Any, Any]:
-    """
-    Make an empty plot for curves over joint steps.
-
-    :param title: Title of the plot, or an empty string for none
-    :param quantity: What the y axis shows, a key of ``QUANTITIES``
-    :return: Figure and axes of matplotlib
-    :raises ImportError: If matplotlib is not installed
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("Plots need matplotlib: pip install 'sb3-belief[plots]'.") from error
-    # pyplot has global state and needs a backend. A figure of its own draws on machines without a screen too
-    figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
-    axes = figure.subplots()
-    axes.set_xlabel("joint steps of the team")
-    axes.set_ylabel(QUANTITIES[quantity])
-    if quantity == "success":
-        axes.set_ylim(-0.02, 1.02)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value >= 1000 else f"{value:g}")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", alpha=0.2)
-    if title:
-        axes.set_title(title, loc="left", fontsize=11, color=INK)
-    return figure, axes
-
-
-def save_figure(figure: Any, output: str | os.PathLike[str]) -> Path:
-    """
-    Write a figure to an image file.
-
-    :param figure: Figure of matplotlib
-    :param output: Image file to write. Its folder is created if necessary
-    :return: Path of the image
-    """
-    path = Path(output)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    return path
+    bins = np.digitize(steps, edges, right=True) - 1
+    inside = (bins >= 0) & (bins < len(edges) - 1)
+    counts = np.bincount(bins[inside], minlength=len(edges) - 1)
+    sums = np.bincount(bins[inside], weights=values[inside], minlength=len(edges) - 1)
+    # 0 / 0 is NaN, which is drawn as a gap
+    with np.errstate(invalid="ignore"):
+        return sums / counts
 
 
 def plot_learning_curve(
@@ -213,17 +168,18 @@ def plot_learning_curve(
     :raises ImportError: If matplotlib is not installed
     :raises ValueError: If the run has finished no episode, for another quantity, or for successes that are not reported
     """
-    check_quantity(quantity or "return")
+    if quantity is not None and quantity not in QUANTITIES:
+        raise ValueError(f"quantity is {quantity!r}; it must be one of {', '.join(map(repr, QUANTITIES))}.")
     steps, returns, successes = read_episodes(folder)
     has_successes = not np.isnan(successes).any()
     if quantity == "success" and not has_successes:
-        raise no_successes(folder)
+        raise ValueError(f"{os.fspath(folder)!r} reports no successes; draw quantity='return'.")
     of_success = has_successes if quantity is None else quantity == "success"
     values = successes if of_success else returns
     # A tenth of the run, so that short runs show a trend too
     window = max(1, min(500, len(values) // 10))
 
-    figure, axes = new_axes(title, "success" if of_success else "return")
+    figure, axes = _new_axes(title, "success" if of_success else "return")
     axes.plot(steps, smooth(values, window), color=CURVE, lw=1.8, label=f"while learning (mean of {window} episodes)")
     label: str | None = "greedy, on other episodes"
     for part in parts_of_run(folder):
@@ -248,4 +204,28 @@ def plot_learning_curve(
         )
     axes.set_xlim(0, steps[-1])
     axes.legend(frameon=False, loc="best", fontsize=9)
-    return save_figure(figure, output)
+    path = Path(output)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    return path
+
+
+def _new_axes(title: str, quantity: str) -> tuple[Any, Any]:
+    """Return an empty plot for curves over joint steps: its figure and axes."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("Plots need matplotlib: pip install 'sb3-belief[plots]'.") from error
+    # pyplot has global state and needs a backend. A figure of its own draws on machines without a screen too
+    figure = Figure(figsize=(8.0, 4.5), dpi=130, layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel("joint steps of the team")
+    axes.set_ylabel(QUANTITIES[quantity])
+    if quantity == "success":
+        axes.set_ylim(-0.02, 1.02)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value >= 1000 else f"{value:g}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", alpha=0.2)
+    if title:
+        axes.set_title(title, loc="left", fontsize=11, color=INK)
+    return figure, axes

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from sb3_belief.common.durable_files import make_folder
-from sb3_belief.report.comparison import binned
 from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.report.figures.curves import Curve, curves_spec
 from sb3_belief.report.figures.drawing import check_drawing
 from sb3_belief.report.figures.theme import arm_colours, arm_dashes
-from sb3_belief.report.learning_curve import QUANTITIES, read_episodes
+from sb3_belief.report.learning_curve import QUANTITIES, binned, read_episodes
 from sb3_belief.report.page.content import unique_name
 from sb3_belief.report.page.files import FIGURE_FORMATS, write_figure
 from sb3_belief.report.study_page.facts import Series, curve_of, thinned

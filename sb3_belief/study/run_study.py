@@ -9,9 +9,9 @@ from sb3_belief.study.cell_record import FAILED, Cell
 from sb3_belief.study.checks import check_study
 from sb3_belief.study.engine import EngineResult, run_local
 from sb3_belief.study.live_table import StudyDisplay
-from sb3_belief.study.specification import load_study
+from sb3_belief.study.specification import Study, load_study
 from sb3_belief.study.study_folder import check_folder_of_study, planned_cells, prepare_folder, write_table
-from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.errors import ConfigError, short
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class StudyOptions:
     :param log_folder: Folder of all studies
     :param jobs: Number of runs at the same time, a process each; None for one, or with Ray for as many as its nodes have
         room for
+    :param envs: Ids of those of its environments whose runs are started, None for all
     :param retry: Whether runs that failed are started again
     :param dry_run: Whether to check everything and to write nothing
     :param engine: ``"local"`` for processes of this machine, ``"ray"`` for tasks of Ray
@@ -33,6 +34,7 @@ class StudyOptions:
     file: str
     log_folder: str = "logs/studies"
     jobs: int | None = None
+    envs: Sequence[str] | None = None
     retry: bool = False
     dry_run: bool = False
     engine: str = "local"
@@ -51,6 +53,7 @@ def run_study(options: StudyOptions) -> int:
     if options.address is not None and options.engine != "ray":
         raise ConfigError("--address: names a Ray cluster: --engine ray.")
     study = load_study(Path(options.file))
+    _check_envs(options.envs, study)
     folder = Path(options.log_folder, study.name)
     checked = check_study(study, folder, options.extra_packages, options.engine, options.dry_run)
     planned = planned_cells(study, folder, checked.configs)
@@ -65,7 +68,7 @@ def run_study(options: StudyOptions) -> int:
         return 0
     for line in prepare_folder(study, folder, planned, options.retry):
         print(line)
-    cells = [each.cell for each in planned]
+    cells = [each.cell for each in planned if options.envs is None or each.record["env"] in options.envs]
     jobs = 1 if options.jobs is None else options.jobs
     with StudyDisplay(study.name, cells, jobs) as display:
         if options.engine == "ray":
@@ -76,7 +79,7 @@ def run_study(options: StudyOptions) -> int:
             result = run_local(cells, jobs, display, options.extra_packages)
     failed = _say_failures(cells, result)
     try:
-        print(f"Episodes: {write_table(folder, cells)}")
+        print(f"Episodes: {write_table(folder, [each.cell for each in planned])}")
     except ConfigError as error:
         # The cells' own files are there, and starting the study again makes the table of them
         print(f"Failed: {error}", file=sys.stderr)
@@ -85,6 +88,13 @@ def run_study(options: StudyOptions) -> int:
         print("Interrupted. The same command goes on.", file=sys.stderr)
         return result.exit_status
     return 1 if failed else 0
+
+
+def _check_envs(env_ids: Sequence[str] | None, study: Study) -> None:
+    trained = dict.fromkeys(env_id for _, env_id in study.pairs())
+    for env_id in env_ids or []:
+        if env_id not in trained:
+            raise ConfigError(f"--envs: {short(env_id)} is none of the environments of {study.source}: {', '.join(trained)}.")
 
 
 def _say_failures(cells: Sequence[Cell], result: EngineResult) -> int:

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from sb3_belief.report.learning_curve import plot_learning_curve, read_episodes, read_monitor, smooth
+from sb3_belief.report.learning_curve import binned, plot_learning_curve, read_episodes, read_monitor, smooth
 from tests.study.folders import write_evaluations
 
 HEADER = '#{"t_start": 0.0, "env_id": "Team"}\nr,l,t,is_success\n'
@@ -162,3 +162,8 @@ def test_return_or_success_at_choice(tmp_path, figures):
     (tmp_path / "monitor.csv").write_text(HEADER + "-1.5,20,0.1,\n")
     with pytest.raises(ValueError, match="reports no successes"):
         plot_learning_curve(tmp_path, tmp_path / "curve.png", quantity="success")
+
+
+def test_each_episode_counts_in_the_bin_in_which_it_ended():
+    means = binned(np.array([5.0, 10.0, 11.0, 40.0]), np.array([1.0, 3.0, 7.0, 9.0]), np.array([0.0, 10.0, 20.0, 30.0, 40.0]))
+    np.testing.assert_array_equal(means, [2.0, 7.0, np.nan, 9.0])

@@ -8,9 +8,10 @@ import time
 
 import pytest
 
+from sb3_belief.cli.main import main
 from sb3_belief.report.episodes import read_episodes_table
 from sb3_belief.study.cell_record import all_cells
-from tests.study.tiny import TINY, record, start, statuses, write
+from tests.study.tiny import EASY, TINY, record, start, statuses, write
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 # A run of about four seconds
@@ -92,3 +93,19 @@ def test_two_processes_share_a_study_without_doubling_a_run(tmp_path):
     assert [record(cell)["attempts"] for cell in cells] == 4 * [1]
     assert all(": finished" in out for _, out in outputs)
     assert read_episodes_table(folder / "tiny" / "episodes.parquet").num_rows == 4 * 32
+
+
+def test_some_environments_first_and_the_rest_later(tmp_path, capsys):
+    settings = TINY["environments"][EASY]
+    medium = EASY.replace("easy", "medium")
+    path, logs = write(tmp_path, environments={EASY: settings, medium: settings}), tmp_path / "logs"
+    words = ["study", str(path), "-f", str(logs)]
+    assert main([*words, "--envs", medium, "hard"]) == 2
+    assert f"--envs: 'hard' is none of the environments of {path}: {EASY}, {medium}." in capsys.readouterr().err
+    assert not logs.exists()
+    assert main([*words, "--envs", medium]) == 0
+    assert statuses(logs / "tiny") == {f"ippo/{EASY}/seed_0": "waiting", f"ippo/{medium}/seed_0": "finished"}
+    assert main(words) == 0
+    assert set(statuses(logs / "tiny").values()) == {"finished"}
+    table = read_episodes_table(logs / "tiny" / "episodes.parquet")
+    assert set(table["environment"].to_pylist()) == {EASY, medium}
