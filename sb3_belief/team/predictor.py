@@ -41,10 +41,15 @@ class Predictor:
     """
 
     def __init__(self, model: BaseAlgorithm, statistics: VecNormalize | None):
-        self._model, self._statistics = model, statistics
+        self.model, self._statistics = model, statistics
         #: Whether the model's ``predict`` takes action masks
         self.takes_masks = takes_masks(model)
         self._state: PolicyState = None
+
+    @property
+    def normalizes(self) -> bool:
+        """Whether the model gets other observations than the environment returns."""
+        return self._statistics is not None
 
     def observed(self, obs: Any) -> Any:
         """
@@ -74,7 +79,7 @@ class Predictor:
         """
         obs = self.observed(obs)
         kwargs: dict[str, Any] = {} if masks is None or not self.takes_masks else {"action_masks": masks}
-        return self._model.predict(obs, state, episode_start, deterministic, **kwargs)
+        return self.model.predict(obs, state, episode_start, deterministic, **kwargs)
 
     def act(self, obs: np.ndarray, episode_start: np.ndarray, masks: np.ndarray | None) -> np.ndarray:
         """

@@ -90,9 +90,11 @@ class Partner:
         trust: Trust = UNTRUSTED,
     ):
         self.rng = RngState(seed)
-        self._name, self._deterministic = name, deterministic
+        self._name, self.deterministic = name, deterministic
         self._state: PolicyState = None
         self._new = True
+        # Nobody else changes a model that was loaded here
+        self._owns_model = False
         statistics: VecNormalize | None = None
         own_statistics: Any = _UNKNOWN
         if isinstance(given, tuple) and len(given) == 2:
@@ -103,6 +105,7 @@ class Partner:
             # Building a network draws random numbers, which must not come from the learner's generators
             with RngSwitch(self.rng):
                 given, statistics = load_model(given, name, trust)
+            self._owns_model = True
         elif isinstance(given, BaseAlgorithm):
             statistics = given.get_vec_normalize_env()
         if own_statistics is not _UNKNOWN:
@@ -140,7 +143,7 @@ class Partner:
         self, obs: Any, state: PolicyState, starts: np.ndarray, masks: np.ndarray | None
     ) -> tuple[np.ndarray, PolicyState]:
         assert self._predictor is not None
-        result = self._predictor.predict(obs, state, starts, self._deterministic, masks)
+        result = self._predictor.predict(obs, state, starts, self.deterministic, masks)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(
                 f"predict() of the partner {self._name!r} returned {result!r}; as SB3's it must return (action, state)."

@@ -8,6 +8,8 @@ from gymnasium import spaces
 
 from sb3_belief.team.agent_models import agent_seed
 from sb3_belief.team.fixed_partners.partners import Partner
+from sb3_belief.team.partners.stacked import StackedMembers, can_be_stacked
+from sb3_belief.team.predictor import Predictor
 from sb3_belief.vec_env.observation_forms import map_parts
 
 
@@ -16,6 +18,11 @@ class CopiesPartner(Partner):
 
     # The copies of which the recurrent state is kept
     _copies = np.zeros(0, dtype=int)
+
+    @property
+    def own_predictor(self) -> Predictor | None:
+        """What it predicts with, if that is a model of its own."""
+        return self._predictor if self._owns_model else None
 
     def act_for(self, copies: np.ndarray, obs: Any, starts: np.ndarray, masks: np.ndarray | None) -> np.ndarray:
         """
@@ -106,6 +113,8 @@ class Seat:
         self._present = np.full(n_envs, -1)
         # Who is present, with the numbers of its copies
         self._groups: list[tuple[int, np.ndarray]] = []
+        predictors = [member.own_predictor for member in self._members]
+        self._stacked = StackedMembers(predictors) if can_be_stacked(predictors) else None  # type: ignore[arg-type]
 
     def reset(self, obs: Any, seed: int | None = None) -> None:
         """
@@ -123,7 +132,8 @@ class Seat:
 
     def act(self, present: np.ndarray, masks: np.ndarray | None) -> np.ndarray:
         """
-        Choose the agent's actions, in one pass for each member that is present.
+        Choose the agent's actions, in one pass for all members that are present if they can be stacked, with the first one's
+        random numbers, or in one for each.
 
         :param present: Index of the member in each copy, int ``[n_envs]``
         :param masks: The agent's possible actions, bool ``[n_envs, k]``, or None
@@ -134,6 +144,12 @@ class Seat:
             self._replace(present)
         if len(self._groups) == 1:
             return self._act_of(self._groups[0][0], self._all, self.obs, self._starts, masks)
+        if self._stacked is not None:
+            first = self._members[0]
+            first.rng.resume()
+            actions = self._stacked.act(present, self.obs, masks, first.deterministic)
+            first.rng.suspend()
+            return actions
         parts = [
             self._act_of(k, rows, _rows_of(self.obs, rows), self._starts[rows], None if masks is None else masks[rows])
             for k, rows in self._groups
