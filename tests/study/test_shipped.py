@@ -20,6 +20,7 @@ def test_all_are_there():
         *aisles,
         "changing_teammates_gate",
         "convention",
+        "convention_episode",
         "lbf",
         "smac_paper",
         "smax",
