@@ -6,6 +6,8 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SMAX_VENV ?= .venv-smax
 SMAX_STAMP := $(SMAX_VENV)/.installed
+TRACKERS_VENV := .venv-trackers
+TRACKERS_STAMP := $(TRACKERS_VENV)/.installed
 RL_ZOO3_VENV := .venv-rl-zoo3
 RL_ZOO3_STAMP := $(RL_ZOO3_VENV)/.installed
 STATISTICS_VENV := .venv-statistics
@@ -24,7 +26,7 @@ BENCH_ARGS ?=
 SOAK_MINUTES ?= 60
 SOAK_SEED ?= 0
 
-.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-statistics pytest conformance soak bench bench-peers docs package \
+.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-trackers test-statistics pytest conformance soak bench bench-peers docs package \
 	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -97,6 +99,17 @@ $(RL_ZOO3_STAMP): setup.cfg pyproject.toml constraints.txt
 
 test-rl-zoo3: $(RL_ZOO3_STAMP)  ## train and search with the real rl_zoo3, in an environment of its own
 	$(RL_ZOO3_VENV)/bin/python -m pytest tests/zoo/test_rl_zoo3.py $(PYTEST_ARGS)
+
+# Ray, wandb and MLflow have an environment of their own: see constraints-trackers.txt. The tests that do without are among the others
+$(TRACKERS_STAMP): setup.cfg pyproject.toml constraints-trackers.txt
+	$(PYTHON) -m venv $(TRACKERS_VENV)
+	$(TRACKERS_VENV)/bin/python -m pip install --quiet -c constraints-trackers.txt torch
+	$(TRACKERS_VENV)/bin/python -m pip install --quiet -c constraints-trackers.txt -e '.[study,ray,track]' pytest
+	@touch $@
+
+test-trackers: $(TRACKERS_STAMP)  ## run a study on Ray and track runs with wandb and MLflow, in an environment of their own
+	$(TRACKERS_VENV)/bin/python -m pytest tests/zoo/test_tracking.py tests/study/test_ray_engine.py \
+		-k 'mlflow_gets_a_run or wandb_gets_a_run or outlives_a_node' $(PYTEST_ARGS)
 
 # rliable and marl-eval have an environment of their own: the one breaks with newer arch, the other pins an old pandas
 $(STATISTICS_STAMP):
