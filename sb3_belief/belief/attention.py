@@ -164,3 +164,52 @@ class _ByRow:
         """Return for each row the weighted sum of the queries that have selected it, ``[T, d]``; weights are ``[B, N]``."""
         by_row = weights.flatten().index_select(0, self._order)
         return F.embedding_bag(self._queries, queries, self._starts, per_sample_weights=by_row, mode="sum")
+
+
+def attend_beside_null(
+    queries: th.Tensor, rows: th.Tensor, bias: th.Tensor, null: th.Tensor, selected: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Return each query's weighted sum of its selected rows, which share a softmax with a null row of no content.
+
+    The scores are products of queries and rows plus a bias. Unlike those of :func:`attend`, the weights have gradients.
+
+    :param queries: ``[B, d]``
+    :param rows: ``[T, d]``, T at least 1
+    :param bias: Added to the scores, ``[B, N]``; minus infinity for a row that takes no part
+    :param null: Scores of the null row, ``[B]``
+    :param selected: The rows, int32 ``[B, N]`` in [0, T)
+    :return: The weighted sums, ``[B, d]``, and the weights, those of the null row last, ``[B, N + 1]``
+    """
+    # A sparse matrix has no more entries in a row than columns
+    if not th.is_grad_enabled() or th.compiler.is_compiling() or selected.shape[1] > len(rows):
+        picked = rows[selected.long()]
+        scores = (queries[:, None] * picked).sum(dim=-1) + bias
+        weights = th.cat([scores, null[:, None]], dim=1).softmax(dim=1)
+        return (weights[:, :-1, None] * picked).sum(dim=1), weights
+    return _AttendBesideNull.apply(queries, rows, bias, null, selected)
+
+
+class _AttendBesideNull(th.autograd.Function):
+    """As :class:`_Attend`, in which a gather of ``[B, N, d]`` and its gradient would take most of the time."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, queries: th.Tensor, rows: th.Tensor, bias: th.Tensor, null: th.Tensor, selected: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        ctx.mask = _mask(selected, len(rows), queries.dtype)
+        weights = th.cat([_products(queries, rows, ctx.mask) + bias, null[:, None]], dim=1).softmax(dim=1)
+        ctx.save_for_backward(queries, rows, selected, weights)
+        return _sums(rows, selected, weights[:, :-1].contiguous()), weights
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        queries, rows, selected, weights = ctx.saved_tensors
+        grad_sums, grad_weights = grad_outputs
+        grad_weights = grad_weights.clone()
+        grad_weights[:, :-1] += _products(grad_sums, rows, ctx.mask)
+        grad_scores = weights * (grad_weights - (grad_weights * weights).sum(dim=1, keepdim=True))
+        of_rows = grad_scores[:, :-1].contiguous()
+        by_row = _ByRow(selected, len(rows))
+        grad_rows = by_row.sums(queries, of_rows) + by_row.sums(grad_sums, weights[:, :-1].contiguous())
+        return _sums(rows, selected, of_rows), grad_rows, of_rows, grad_scores[:, -1], None

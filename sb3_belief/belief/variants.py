@@ -11,11 +11,13 @@ class Variant(NamedTuple):
     :param attends: Whether the belief is inferred from the agent's history too (eq. 3 and 4), or from its observation alone
     :param samples: Whether the belief is a distribution (eq. 5), which the KL divergence keeps near the prior, or a point
     :param predicts: Whether the belief is trained by predicting the others' actions (eq. 7)
+    :param online: Whether the history includes the earlier steps of the rollout under way (issue 20)
     """
 
     attends: bool
     samples: bool
     predicts: bool
+    online: bool = False
 
 
 #: The values of ``belief`` other than ``"none"``. ``dynamic`` is the paper's method, ``static`` and ``variational`` are its
@@ -31,3 +33,6 @@ VARIANTS: MappingProxyType[str, Variant] = MappingProxyType(
         "wide": Variant(attends=False, samples=False, predicts=False),
     }
 )
+
+#: The parts of :class:`~sb3_belief.belief.AdaptiveBelief`, ``belief="adaptive"``, which is no variant of the paper's network
+ADAPTIVE = Variant(attends=True, samples=False, predicts=True, online=True)

@@ -69,7 +69,7 @@ def test_what_a_variant_does_not_use_is_not_built(variant):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_what_a_variant_does_not_have_does_not_matter(variant):
     net = DynamicBelief(D_O, W, D, Z, variant=variant)
-    attends, samples, _ = VARIANTS[variant]
+    attends, samples, *_ = VARIANTS[variant]
     observations = th.randn(7, D_O)
     history, noise = random_history(), th.randn(7, Z)
     plain = net(observations, history).latent
