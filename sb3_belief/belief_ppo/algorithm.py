@@ -10,15 +10,18 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_selected
+from sb3_belief.belief.memory import Memory, followed_by, valid_rows
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.extractor import fitting_extractor
@@ -63,6 +66,10 @@ class BeliefAlgorithmMixin(_Algorithm):
     policy_latent: str
     similarity: str
     detach_belief: bool
+    n_own: int
+    n_pool: int
+    row_features: tuple[str, ...]
+    history_dropout: float
     #: Whether the belief sees features unless policy_kwargs say otherwise. Models saved before it could do not
     belief_from_features: bool
     action_coef: float | Schedule
@@ -153,9 +160,15 @@ class BeliefAlgorithmMixin(_Algorithm):
         layout, variant = action_layout(self.others_action_spaces), self._options.variant
         if variant is None or layout.n_others == 0:
             return {}
+        if variant.online:
+            # And the null row
+            most_selected = self.n_own + self.n_pool + 1
+        else:
+            most_selected = n_selected(self.keep_ratio, self.history_length) if variant.attends else 0
         return dict(
+            is_online=variant.online,
             noise_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM) if variant.samples else 0,
-            max_selected=n_selected(self.keep_ratio, self.history_length) if variant.attends else 0,
+            max_selected=most_selected,
             others_width=layout.width,
             n_others=layout.n_others,
         )
@@ -266,13 +279,64 @@ class BeliefAlgorithmMixin(_Algorithm):
             if learns:
                 self._update()
             return
-        observations, actions = buffer.recent(self.history_length)
+        extractor = policy.features_extractor
+        if isinstance(extractor, AdaptiveExtractor):
+            extractor.table = followed_by(valid_rows(extractor.history), self.remembered(0, buffer.buffer_size))
+        else:
+            observations, actions = buffer.recent(self.history_length)
         for name, value in measure_belief(policy, buffer).items():
             self.logger.record(f"belief/{name}", value)
         policy.action_coef, policy.kl_coef = self._coefficient("action_coef"), self._coefficient("kl_coef")
         if learns:
             self._update()
-        policy.remember(observations, actions)
+        if isinstance(extractor, AdaptiveExtractor):
+            extractor.table = None
+            extractor.append(self.remembered(0, buffer.buffer_size, is_over=True))
+        else:
+            policy.remember(observations, actions)
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
+        """
+        Collect a rollout as SB3 does; a belief that is online also attends to its earlier steps.
+
+        :param args: As in SB3 or sb3-contrib
+        :param kwargs: As in SB3 or sb3-contrib
+        :return: As in SB3
+        """
+        extractor = self.policy.features_extractor if self._has_belief else None
+        if not isinstance(extractor, AdaptiveExtractor):
+            return super().collect_rollouts(*args, **kwargs)
+        self.rollout_buffer.reset()
+        extractor.online = OnlineMemory(self)
+        try:
+            return super().collect_rollouts(*args, **kwargs)
+        finally:
+            extractor.online = None
+
+    @th.no_grad()
+    def remembered(self, first: int, last: int, is_over: bool = False) -> Memory:
+        """
+        Return steps of the present rollout as an adaptive belief remembers them.
+
+        :param first: Number of the first step in the rollout
+        :param last: Number of the step after the last one
+        :param is_over: Whether to include what was seen of others while the agent waited for its next turn, which is not known
+            yet while the rollout attends to its own steps
+        :return: ``(last - first) * n_envs`` rows, those of all copies at each step
+        """
+        buffer, policy = self.rollout_buffer, self.policy
+        rows = buffer.rows_of(np.arange(first * self.n_envs, last * self.n_envs))
+        raw: Any = buffer.observations
+        seen = {key: part[rows] for key, part in raw.items()} if isinstance(raw, dict) else raw[rows]
+        flat = policy.flat_observations(obs_as_tensor(seen, policy.device))
+        actions = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ()))
+        own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
+        seen_actions, visible = buffer.attended_actions, buffer.attended_visible
+        if is_over:
+            seen_actions, visible = buffer.others_actions, buffer.others_visible
+        valid = buffer.active[rows] & visible[rows].any(axis=1)
+        parts = seen_actions[rows], own, buffer.stamps[rows], valid
+        return Memory(flat, *(th.as_tensor(part, device=policy.device) for part in parts))
 
     def _coefficient(self, name: str) -> float:
         """Return and log the present value of a loss coefficient, which may be a schedule."""

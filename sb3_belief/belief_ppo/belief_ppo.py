@@ -1,5 +1,6 @@
 """Proximal Policy Optimization conditioned on a dynamic belief about the other agents."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch as th
@@ -8,6 +9,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_belief.belief import ROW_FEATURES
 from sb3_belief.belief_ppo.algorithm import BeliefAlgorithmMixin, refuse_many_agents
 from sb3_belief.belief_ppo.buffers import BeliefDictRolloutBuffer, BeliefRolloutBuffer
 from sb3_belief.belief_ppo.options import BeliefOptions
@@ -74,6 +76,11 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param similarity: What past steps are compared with the present by: the ``"embedding"`` (eq. 3) or the ``"observation"``
         itself (Fig. 5b)
     :param detach_belief: Whether to keep the gradient of policy and value out of the belief network
+    :param n_own: Of ``"adaptive"``: most steps of the same copy of the environment that it attends to, at least 0
+    :param n_pool: Of ``"adaptive"``: most steps of the other copies that it attends to, at least 0
+    :param row_features: Of ``"adaptive"``: what a step in its memory tells beside the agent's observation and what it saw the
+        others do, of ``"own_action"``, ``"reward"``, ``"age"``, ``"episode"`` (whether it is of the same one) and ``"copy"``
+    :param history_dropout: Of ``"adaptive"``: share of the steps in training at which it sees nothing of its memory, in [0, 1)
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -126,6 +133,10 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,
+        n_own: int = 32,
+        n_pool: int = 32,
+        row_features: Sequence[str] = ROW_FEATURES,
+        history_dropout: float = 0.0,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -156,7 +167,19 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             device=device,
             _init_setup_model=False,
         )
-        options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
+        options = BeliefOptions(
+            belief=belief,
+            history_length=history_length,
+            keep_ratio=keep_ratio,
+            action_loss=action_loss,
+            policy_latent=policy_latent,
+            similarity=similarity,
+            detach_belief=detach_belief,
+            n_own=n_own,
+            n_pool=n_pool,
+            row_features=row_features,
+            history_dropout=history_dropout,
+        )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()

@@ -79,12 +79,15 @@ class BeliefMinibatch(NamedTuple):
     :param selected: The history rows it attended to, ``[B, N_h]``; of width 0 for a belief without a history
     :param others_actions: The others' flattened actions, ``[B, W]``, zero where not visible
     :param others_visible: Whose action was visible, bool ``[B, n_others]``
+    :param stamps: When and where each step was, as of :class:`~sb3_belief.belief.memory.Memory`; None for a belief that is not
+        online
     """
 
     noise: th.Tensor
     selected: th.Tensor
     others_actions: th.Tensor
     others_visible: th.Tensor
+    stamps: th.Tensor | None = None
 
 
 def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
@@ -125,9 +128,12 @@ if TYPE_CHECKING:
 else:
     _Buffer = object
 
-# The place of the values among the arguments of add()
-_VALUE = 4
-_EXTRAS = ("noise", "selected", "others_actions", "others_visible", "active")
+# The places of rewards and values among the arguments of add()
+_REWARD, _VALUE = 2, 4
+_EXTRAS = (
+    *("noise", "selected", "others_actions", "others_visible", "active"),
+    *("stamps", "own_rewards", "attended_actions", "attended_visible"),
+)
 
 
 class BeliefBufferMixin(_Buffer):
@@ -138,6 +144,7 @@ class BeliefBufferMixin(_Buffer):
     :param max_selected: The most history rows that are attended to, ``N_h``, 0 where none are
     :param others_width: ``W``, 0 without a belief
     :param n_others: Number of others, 0 without a belief
+    :param is_online: Whether the belief attends to earlier steps of the rollout, so that their stamps and rewards are kept
     """
 
     noise: np.ndarray
@@ -153,10 +160,14 @@ class BeliefBufferMixin(_Buffer):
         max_selected: int = 0,
         others_width: int = 0,
         n_others: int = 0,
+        is_online: bool = False,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
         self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
+        self._is_online = is_online
+        # In each copy, the number of the step with which the present episode began
+        self._began = np.zeros(0, dtype=np.int64)
         super().__init__(*args, **kwargs)
         self._cut_returns = CutReturns(self.n_envs, self.gamma)
 
@@ -168,6 +179,13 @@ class BeliefBufferMixin(_Buffer):
         self.others_actions = np.zeros((*rows, self._widths["others_actions"]), dtype=np.float32)
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
         self.active = np.ones(rows, dtype=bool)
+        self.stamps = np.zeros((*rows, 3 if self._is_online else 0), dtype=np.int64)
+        self.own_rewards = np.zeros(rows if self._is_online else (*rows, 0), dtype=np.float32)
+        # As they are attended to within the rollout: what is seen of others while the agent waits comes into a row later on
+        self.attended_actions = np.zeros((*rows, self._widths["others_actions"] if self._is_online else 0), dtype=np.float32)
+        self.attended_visible = np.zeros((*rows, self._widths["others_visible"] if self._is_online else 0), dtype=bool)
+        #: What the rewards of the step that is added next have been raised by, which the agent has not got
+        self.bootstraps = np.zeros(self.n_envs, dtype=np.float32)
         # Whether it is in play at the observation after the last step
         self._next_active = np.ones(self.n_envs, dtype=bool)
         # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
@@ -223,7 +241,29 @@ class BeliefBufferMixin(_Buffer):
             self._n_selected = sampled.selected.shape[1]
             self.noise[self.pos] = sampled.noise.cpu().numpy()
             self.selected[self.pos, :, : self._n_selected] = sampled.selected.cpu().numpy()
+        if self._is_online:
+            self.own_rewards[self.pos] = (
+                np.asarray(kwargs["reward"] if "reward" in kwargs else args[_REWARD]) - self.bootstraps
+            )
+            self.bootstraps[:] = 0.0
+            self.attended_actions[self.pos] = self.others_actions[self.pos]
+            self.attended_visible[self.pos] = self.others_visible[self.pos]
         super().add(*args, **kwargs)
+
+    def stamp(self, now: int, starts: np.ndarray) -> np.ndarray:
+        """
+        Return when and where the step is that is added next, and keep it.
+
+        :param now: Its number
+        :param starts: Whether an episode starts with it, bool ``[n_envs]``
+        :return: As of :class:`~sb3_belief.belief.memory.Memory`, int64 ``[n_envs, 3]``
+        """
+        self._began = np.where(starts, now, self._began if len(self._began) else now)
+        stamps = np.stack([np.full(self.n_envs, now), np.arange(self.n_envs), self._began], axis=1)
+        # After a rollout its last observations are asked for, which are the first of the next
+        if self.pos < self.buffer_size:
+            self.stamps[self.pos] = stamps
+        return stamps
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
         """
@@ -337,7 +377,9 @@ class BeliefBufferMixin(_Buffer):
         :return: Their data, on the buffer's device; for a slice it is a part of the buffer itself
         """
         selected = self.selected[rows][..., : self._n_selected]
-        parts = self.noise[rows], selected, self.others_actions[rows], self.others_visible[rows]
+        parts = [self.noise[rows], selected, self.others_actions[rows], self.others_visible[rows]]
+        if self._is_online:
+            parts.append(self.stamps[rows])
         return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 

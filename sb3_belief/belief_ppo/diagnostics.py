@@ -56,7 +56,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     if isinstance(policy.mlp_extractor, BeliefFusion):
         measured["fusion_ratio"] = policy.mlp_extractor.belief_share()
     # The rollout has encoded the history already
-    output = policy.features_extractor.infer(flat, minibatch.noise, minibatch.selected)
+    output = policy.features_extractor.judged(flat, minibatch)
     if variant.samples:
         measured["kl"] = float(kl_divergence(output.mean, output.log_std))
     if variant.attends:
@@ -66,9 +66,11 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     measured["action_loss"] = float(policy.action_error(output.prediction, minibatch))
     if policy.layout.blocks:
         measured["history_gain_rare"] = 0.0
-    if policy.history is not None and policy.history.valid.any():
-        with_shuffled = policy.history._replace(actions=_shuffled(policy.history.actions, policy.history.valid))
-        shuffled = belief(flat, with_shuffled, minibatch.noise, minibatch.selected)
+    history = policy.features_extractor.attended()
+    if history is not None and history.valid.any():
+        with_shuffled = history._replace(actions=_shuffled(history.actions, history.valid))
+        shuffled = policy.features_extractor.judged(flat, minibatch, with_shuffled)
+        assert shuffled.prediction is not None
         measured["history_gain"] = float(policy.action_error(shuffled.prediction, minibatch)) - measured["action_loss"]
         if policy.layout.blocks:
             rare = minibatch._replace(others_visible=_did_the_rare(minibatch, policy.layout))

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
+from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.options import BeliefOptions
 from sb3_belief.common.kept_tensors import KeptTensors
 
@@ -75,12 +76,16 @@ class BeliefPass:
     :param noise: The noise of eq. 5, ``[B, z]``; None for the mean of the belief
     :param selected: The history rows to attend to, ``[B, N_h]``; None for the most similar ones
     :param sample: Whether to draw the noise in this pass
+    :param acts: Whether it is a pass of the agent's own rollout, which a belief that is online attends to
+    :param stamps: When and where the observations were made, for a belief that is online, int64 ``[B, 3]``
     :param output: The belief
     """
 
     noise: th.Tensor | None = None
     selected: th.Tensor | None = None
     sample: bool = False
+    acts: bool = False
+    stamps: th.Tensor | None = None
     output: BeliefOutput | None = None
 
 
@@ -129,14 +134,18 @@ class BeliefExtractor(BaseFeaturesExtractor):
         super().__init__(observation_space, features.features_dim + belief.latent_dim)
         self.features = features
         self.belief = belief
+        #: Width of what policy and value are given of the belief
+        self.belief_width = belief.latent_dim
         self.options = options
         self.from_features = from_features
         if belief.variant.attends:
-            history = empty_history(options.history_length, belief.observation_dim, belief.action_dim)
-            for name, rows in history._asdict().items():
+            for name, rows in self._empty_history()._asdict().items():
                 self.register_buffer(f"history_{name}", rows)
         self._context: HistoryContext | None = None
         self._context_inputs = KeptTensors()
+
+    def _empty_history(self) -> Any:
+        return empty_history(self.options.history_length, self.belief.observation_dim, self.belief.action_dim)
 
     def __getstate__(self) -> dict[str, Any]:
         # The encoded history is made again where it is needed
@@ -180,12 +189,21 @@ class BeliefExtractor(BaseFeaturesExtractor):
         belief_pass = belief_pass or BeliefPass()
         own = self.features(observations)
         flat = own if self.from_features else flatten_observation(observations)
+        belief_pass.output = self.believe(flat, belief_pass)
+        return self.with_belief(own, belief_pass.output)
+
+    def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:
+        """
+        Infer the belief of a pass.
+
+        :param flat: Preprocessed flat observations, ``[B, d_o]``
+        :param belief_pass: How to draw it
+        :return: The belief
+        """
         if belief_pass.sample:
             belief_pass.noise = self.draw_noise(flat)
         # While acting, no prediction is needed
-        output = self.infer(flat, belief_pass.noise, belief_pass.selected, predict=th.is_grad_enabled())
-        belief_pass.output = output
-        return self.with_belief(own, output)
+        return self.infer(flat, belief_pass.noise, belief_pass.selected, predict=th.is_grad_enabled())
 
     def draw_noise(self, flat: th.Tensor) -> th.Tensor | None:
         """
@@ -205,7 +223,9 @@ class BeliefExtractor(BaseFeaturesExtractor):
         :return: Both, the belief as the options want it; in one tensor ``[B, features_dim]`` if ``in_one_tensor``
         """
         # The paper gives policy and value the sampled belief; the decoder predicts from it in any case
-        latent = output.latent if self.options.policy_latent == "sample" else output.mean
+        return self._beside(own, output.latent if self.options.policy_latent == "sample" else output.mean)
+
+    def _beside(self, own: th.Tensor, latent: th.Tensor) -> BeliefFeatures | th.Tensor:
         features = BeliefFeatures(own, latent.detach() if self.options.detach_belief else latent)
         return th.cat(features, dim=-1) if self.in_one_tensor else features
 
@@ -225,6 +245,37 @@ class BeliefExtractor(BaseFeaturesExtractor):
         # An update changes the weights with each minibatch and needs their gradients, so it encodes the history each time
         context = None if history is None or th.is_grad_enabled() else self.encoded(history)
         return self.belief(flat, history, noise, selected, context, predict)
+
+    def context(self) -> Any:
+        """Return the encoded history; None for a belief without one."""
+        return None if self.history is None else self.belief.encode_history(self.history)
+
+    def infer_from(self, context: Any, flat: th.Tensor) -> BeliefOutput:
+        """
+        Infer the mean of the belief from an encoded history.
+
+        :param context: As of :meth:`context`
+        :param flat: Preprocessed flat observations, ``[B, d_o]``
+        :return: The belief
+        """
+        return self.belief(flat, context=context)
+
+    def attended(self) -> History | None:
+        """Return what the rows of an update attend to."""
+        return self.history
+
+    def judged(self, flat: th.Tensor, minibatch: BeliefMinibatch, history: Any = None) -> BeliefOutput:
+        """
+        Infer the belief of a minibatch as it was while acting.
+
+        :param flat: Its preprocessed flat observations, ``[B, d_o]``
+        :param minibatch: Its noise and the rows it attended to
+        :param history: What it attends to instead of :meth:`attended`
+        :return: The belief
+        """
+        if history is None:
+            return self.infer(flat, minibatch.noise, minibatch.selected)
+        return self.belief(flat, history, minibatch.noise, minibatch.selected)
 
     def encoded(self, history: History) -> HistoryContext:
         """

@@ -1,5 +1,6 @@
 """Belief PPO with invalid action masking."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch as th
@@ -11,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_belief.belief import ROW_FEATURES
 from sb3_belief.belief_ppo.algorithm import BeliefAlgorithmMixin, refuse_many_agents
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin
 from sb3_belief.belief_ppo.options import BeliefOptions
@@ -94,6 +96,10 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param policy_latent: As in BeliefPPO
     :param similarity: As in BeliefPPO
     :param detach_belief: As in BeliefPPO
+    :param n_own: As in BeliefPPO
+    :param n_pool: As in BeliefPPO
+    :param row_features: As in BeliefPPO
+    :param history_dropout: As in BeliefPPO
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -144,6 +150,10 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,
+        n_own: int = 32,
+        n_pool: int = 32,
+        row_features: Sequence[str] = ROW_FEATURES,
+        history_dropout: float = 0.0,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -172,7 +182,19 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             device=device,
             _init_setup_model=False,
         )
-        options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
+        options = BeliefOptions(
+            belief=belief,
+            history_length=history_length,
+            keep_ratio=keep_ratio,
+            action_loss=action_loss,
+            policy_latent=policy_latent,
+            similarity=similarity,
+            detach_belief=detach_belief,
+            n_own=n_own,
+            n_pool=n_pool,
+            row_features=row_features,
+            history_dropout=history_dropout,
+        )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()

@@ -1,6 +1,6 @@
 """How the networks of a policy with a belief are built."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,10 +13,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_belief.belief import DynamicBelief
+from sb3_belief.belief import ROW_FEATURES, AdaptiveBelief, DynamicBelief
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, fitting_extractor
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import action_layout
+from sb3_belief.common.action_encoding import RowEncoder
 
 if TYPE_CHECKING:
     _Policy = ActorCriticPolicy
@@ -40,6 +42,10 @@ class BeliefNetworksMixin(_Policy):
     :param policy_latent: As in :class:`~sb3_belief.BeliefPPO`
     :param similarity: As in :class:`~sb3_belief.BeliefPPO`
     :param detach_belief: As in :class:`~sb3_belief.BeliefPPO`
+    :param n_own: As in :class:`~sb3_belief.BeliefPPO`
+    :param n_pool: As in :class:`~sb3_belief.BeliefPPO`
+    :param row_features: As in :class:`~sb3_belief.BeliefPPO`
+    :param history_dropout: As in :class:`~sb3_belief.BeliefPPO`
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
@@ -65,6 +71,10 @@ class BeliefNetworksMixin(_Policy):
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,
+        n_own: int = 32,
+        n_pool: int = 32,
+        row_features: Sequence[str] = ROW_FEATURES,
+        history_dropout: float = 0.0,
         embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
@@ -72,7 +82,19 @@ class BeliefNetworksMixin(_Policy):
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which builds the networks
-        self.options = BeliefOptions(belief, history_length, keep_ratio, action_loss, policy_latent, similarity, detach_belief)
+        self.options = BeliefOptions(
+            belief=belief,
+            history_length=history_length,
+            keep_ratio=keep_ratio,
+            action_loss=action_loss,
+            policy_latent=policy_latent,
+            similarity=similarity,
+            detach_belief=detach_belief,
+            n_own=n_own,
+            n_pool=n_pool,
+            row_features=row_features,
+            history_dropout=history_dropout,
+        )
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, Integral) or width < 1:
                 raise ValueError(f"{name} is {width!r}; it must be an integer of at least 1")
@@ -106,16 +128,19 @@ class BeliefNetworksMixin(_Policy):
             if not self.ortho_init:
                 # Nothing else draws the rest anew, whose first layer would start with the very weights of the belief's
                 th.manual_seed(int(th.randint(2**62, ())))
-            belief = DynamicBelief(
-                features.features_dim if self.belief_from_features else get_flattened_obs_dim(self.observation_space),
-                self.layout.width,
-                self.embedding_dim,
-                self.latent_dim,
-                self.options.keep_ratio,
-                self.options.belief,
-                self.options.similarity,
-            )
-        return BeliefExtractor(self.observation_space, features, belief, self.options, self.belief_from_features)
+            sees = features.features_dim if self.belief_from_features else get_flattened_obs_dim(self.observation_space)
+            widths, options = (self.embedding_dim, self.latent_dim), self.options
+            if options.belief == "adaptive":
+                own = RowEncoder("the agent", self.action_space).width + 1
+                n_own, n_pool, features_of_rows = options.n_own, options.n_pool, options.row_features
+                adaptive = AdaptiveBelief(sees, self.layout.width, own, *widths, n_own, n_pool, features_of_rows)
+            else:
+                keep_ratio, variant, similarity = options.keep_ratio, options.belief, options.similarity
+                belief = DynamicBelief(sees, self.layout.width, *widths, keep_ratio, variant, similarity)
+        given = self.belief_from_features
+        if options.belief == "adaptive":
+            return AdaptiveExtractor(self.observation_space, features, adaptive, options, given, self.layout)
+        return BeliefExtractor(self.observation_space, features, belief, options, given)
 
     def _build_mlp_extractor(self) -> None:
         if not self.has_belief:
@@ -124,7 +149,7 @@ class BeliefNetworksMixin(_Policy):
         assert isinstance(self.features_extractor, BeliefExtractor)
         self.mlp_extractor = BeliefFusion(  # type: ignore[assignment]
             self.features_extractor.features.features_dim,
-            self.latent_dim,
+            self.features_extractor.belief_width,
             self.net_arch,
             self.activation_fn,
             self.fusion_activation_fn,

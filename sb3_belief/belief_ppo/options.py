@@ -1,13 +1,15 @@
 """The options of a belief, and checks of what makes no sense."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
-from sb3_belief.belief import ACTION_LOSSES, SIMILARITIES, VARIANTS, ActionLayout, Variant
+from sb3_belief.belief import ACTION_LOSSES, ADAPTIVE, ROW_FEATURES, SIMILARITIES, VARIANTS, ActionLayout, Variant
+from sb3_belief.common.checks import check_integer
 
 #: The variants, and PPO without a belief
-BELIEFS = (*VARIANTS, "none")
+_VARIANTS = {**VARIANTS, "adaptive": ADAPTIVE}
+BELIEFS = (*_VARIANTS, "none")
 POLICY_LATENTS = ("sample", "mean")
 #: Default widths of the embeddings and of the belief
 EMBEDDING_DIM = 64
@@ -29,6 +31,10 @@ class BeliefOptions:
     policy_latent: str = "sample"
     similarity: str = "embedding"
     detach_belief: bool = False
+    n_own: int = 32
+    n_pool: int = 32
+    row_features: Sequence[str] = ROW_FEATURES
+    history_dropout: float = 0.0
 
     def __post_init__(self) -> None:
         _check_choice("belief", self.belief, BELIEFS)
@@ -45,16 +51,32 @@ class BeliefOptions:
                 f"keep_ratio is {self.keep_ratio!r}; it must be in (0, 1]: the share of the history attended to (the paper "
                 "uses 0.05). For a belief that attends to none of it use belief='variational' or 'static'."
             )
+        self._check_online()
         if self.detach_belief and self.belief == "wide":
             raise ValueError(
                 "belief='wide' is trained by nothing but the gradient of policy and value, which detach_belief=True keeps out "
                 "of it; leave detach_belief False."
             )
 
+    def _check_online(self) -> None:
+        """Check what belongs to a belief that is online."""
+        for name, given in (("n_own", self.n_own), ("n_pool", self.n_pool)):
+            check_integer(name, given, 0, "the most rows of the memory that are attended to")
+        if self.belief == "adaptive" and self.n_own + self.n_pool == 0:
+            raise ValueError("n_own and n_pool are 0, so nothing would be attended to; for such a belief use belief='static'.")
+        if isinstance(self.row_features, str):
+            raise ValueError(f"row_features is {self.row_features!r}; it must be a list of some of {', '.join(ROW_FEATURES)}")
+        # Lists come from YAML and from files
+        object.__setattr__(self, "row_features", tuple(self.row_features))
+        for name in self.row_features:
+            _check_choice("row_features: an entry", name, ROW_FEATURES)
+        if not 0 <= self.history_dropout < 1:
+            raise ValueError(f"history_dropout is {self.history_dropout!r}; it must be in [0, 1): a share of the steps")
+
     @property
     def variant(self) -> Variant | None:
         """The parts that the belief has; None without a belief."""
-        return VARIANTS.get(self.belief)
+        return _VARIANTS.get(self.belief)
 
     def check_others(self, names: Collection[str], layout: ActionLayout) -> None:
         """

@@ -21,7 +21,8 @@ class OthersPrediction(NamedTuple):
         (Discrete), of each value dimension after dimension (MultiDiscrete), of a one (MultiBinary), or the mean (Box)
     :param mean: Mean of the belief, ``[B, z]``
     :param std: Its standard deviation, ``[B, z]``; 0 where the belief is a single point
-    :param rows: The rows of ``policy.history`` that were attended to, int ``[B, N_h]``
+    :param rows: The rows of ``policy.history`` that were attended to, int ``[B, N_h]``; -1 for the null row of an adaptive
+        belief, which has no step behind it
     :param weights: Their weights in the attention, ``[B, N_h]``, adding up to 1
     """
 

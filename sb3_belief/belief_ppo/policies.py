@@ -9,19 +9,15 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch.distributions import Distribution
 
-from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, DynamicBelief, History, expected_actions, kl_divergence
+from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, expected_actions, kl_divergence
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass, flat_observations
-from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
-from sb3_belief.belief_ppo.others import OthersPrediction, others_rows
-
-# Of how many observations the features are computed at a time
-_FEATURE_ROWS = 64
+from sb3_belief.belief_ppo.extractor import BeliefPass
+from sb3_belief.belief_ppo.others import OthersPrediction
+from sb3_belief.belief_ppo.remembering import RememberingMixin
 
 
 def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,6 +30,10 @@ def _fused_adam_kwargs(optimizer_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
     chosen = optimizer_kwargs.keys() & {"fused", "foreach", "capturable", "differentiable"}
     return dict(optimizer_kwargs) if chosen else {**optimizer_kwargs, "fused": True}
+
+
+def _n_rows(obs: PyTorchObs) -> int:
+    return len(next(iter(obs.values()))) if isinstance(obs, dict) else len(obs)
 
 
 class _Unchecked:
@@ -79,7 +79,7 @@ def add_loss(values: th.Tensor, loss: th.Tensor) -> th.Tensor:
     return _AddLoss.apply(values, loss)
 
 
-class BeliefPolicyMixin(BeliefNetworksMixin):
+class BeliefPolicyMixin(RememberingMixin):
     """
     Makes an SB3 actor-critic policy one with a belief.
 
@@ -96,86 +96,6 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         if self.optimizer_class is th.optim.Adam:
             self.optimizer_kwargs = _fused_adam_kwargs(self.optimizer_kwargs)
         super()._build(lr_schedule)
-
-    # -- what the algorithm and users call ------------------------------------------------------------------------------
-
-    @property
-    def _extractor(self) -> BeliefExtractor:
-        assert isinstance(self.features_extractor, BeliefExtractor)
-        return self.features_extractor
-
-    @property
-    def belief(self) -> DynamicBelief | None:
-        """The belief network, if there is one."""
-        return self._extractor.belief if self.has_belief else None
-
-    @property
-    def history(self) -> History | None:
-        """The history from which the belief is inferred at present, if there is a belief that has one."""
-        return self._extractor.history if self.has_belief else None
-
-    def restore_history(self, history: History) -> None:
-        """
-        Put an earlier history back, to forget what was remembered since.
-
-        :param history: A value that :attr:`history` had
-        """
-        self._extractor.restore_history(history)
-
-    def remember(
-        self,
-        observations: np.ndarray | dict[str, np.ndarray],
-        actions: np.ndarray | Mapping[str, Any],
-        visible: Mapping[str, Any] | None = None,
-    ) -> None:
-        """
-        Append the agent's own active steps to its history, which is all that it needs to adapt to other teammates.
-
-        The algorithm does so after each update; for a deployed agent its user does. A belief without a history remembers
-        nothing.
-
-        :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
-        :param actions: What the others did at these steps: ``{name: actions}``, each ``[N, ...]`` in that other's own space,
-            without the others that were not visible at any; or all flattened and side by side, ``[N, W]``, zero where not
-            visible, as in ``info["others_actions"]``
-        :param visible: ``{name: bool [N]}``, at which of the steps each other was visible; at all of them if it is left out.
-            What stands in ``actions`` at the other steps is ignored
-        :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
-            is not finite
-        """
-        if self.history is None:
-            return
-        # A tensor that is made in inference mode could never be trained on
-        with th.inference_mode(False), th.no_grad():
-            # obs_to_tensor() accepts images with the channels last, as the environment returns them
-            rows = self.flat_observations(self.obs_to_tensor(observations)[0])
-            if not bool(th.isfinite(rows).all()):
-                raise ValueError(
-                    "observations to remember hold a number that is not finite: attention to such a row would make all later "
-                    "actions NaN; leave these steps out"
-                )
-            encoded = others_rows(self.others_action_spaces, actions, visible, len(rows))
-            self._extractor.remember(rows, th.as_tensor(encoded, device=self.device))
-
-    def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
-        """
-        Convert observations to what belief and history take: preprocessed as SB3 does and flat, or their features.
-
-        :param observations: Observations as the environment returns them, batch first
-        :return: ``[B, d_o]``
-        """
-        if not (self.has_belief and self._extractor.from_features):
-            return flat_observations(self, observations)
-        self.set_training_mode(False)
-        # A few at a time: the images of a whole history would take gigabytes as floats
-        parts = observations if isinstance(observations, dict) else {"": observations}
-        features = []
-        with th.no_grad():
-            for rows in zip(*(part.split(_FEATURE_ROWS) for part in parts.values()), strict=True):
-                some: Any = dict(zip(parts, rows, strict=True))
-                some = some if isinstance(observations, dict) else some[""]
-                features.append(self._extractor.features(preprocess_obs(some, self.observation_space, self.normalize_images)))
-        return th.cat(features)
 
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 
@@ -211,7 +131,7 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         if not self.has_belief:
             with self._distributions(trusted=not deterministic):
                 return super().forward(obs, deterministic, *args, **kwargs)
-        belief_pass = BeliefPass(sample=not deterministic)
+        belief_pass = BeliefPass(sample=not deterministic, acts=True)
         with self._distributions(trusted=not deterministic):
             actions, values, log_prob = super().forward(attach(obs, belief_pass), deterministic, *args, **kwargs)
         output, noise = belief_pass.output, belief_pass.noise
@@ -245,7 +165,12 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         :return: Values, ``[B, 1]``
         """
         value = attached(obs)
-        return value if isinstance(value, th.Tensor) else super().predict_values(obs)
+        if isinstance(value, th.Tensor):
+            return value
+        # SB3 asks for the values of the observations after a rollout, in all copies
+        if self.online is not None and value is None and _n_rows(obs) == len(self.online.stamps()):
+            obs = attach(obs, BeliefPass(acts=True))
+        return super().predict_values(obs)
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         """
@@ -264,7 +189,7 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         if not (self.has_belief and isinstance(minibatch, BeliefMinibatch)):
             with self._distributions():
                 return super().evaluate_actions(obs, actions, *args, **kwargs)
-        belief_pass = BeliefPass(minibatch.noise, minibatch.selected)
+        belief_pass = BeliefPass(minibatch.noise, minibatch.selected, stamps=minibatch.stamps)
         with self._distributions():
             # What L_PPO is computed from
             values, log_prob, entropy = super().evaluate_actions(attach(obs, belief_pass), actions, *args, **kwargs)
@@ -308,15 +233,24 @@ class BeliefPolicyMixin(BeliefNetworksMixin):
         :param infos: One step's `info` of each copy; their terminal observations are replaced by equal ones that carry a value
         :param dones: Which copies ended with this step, bool ``[n_envs]``
         """
-        ended = [info for info, done in zip(infos, dones, strict=False) if done and info.get("TimeLimit.truncated", False)]
-        ended = [info for info in ended if info.get("terminal_observation") is not None]
-        # For a single one nothing is gained
-        if len(ended) < 2:
+        copies = [
+            copy
+            for copy, (info, done) in enumerate(zip(infos, dones, strict=False))
+            if done and info.get("TimeLimit.truncated", False) and info.get("terminal_observation") is not None
+        ]
+        # For a single one nothing is gained, except that a belief that is online is told of which copy it is
+        if len(copies) < (2 if self.online is None else 1):
             return
+        ended = [infos[copy] for copy in copies]
         rows = [info["terminal_observation"] for info in ended]
         batch = {key: np.stack([row[key] for row in rows]) for key in rows[0]} if isinstance(rows[0], dict) else np.stack(rows)
         with th.no_grad():
-            values = self.predict_values(self.obs_to_tensor(batch)[0])
+            tensor = self.obs_to_tensor(batch)[0]
+            if self.online is not None:
+                tensor = attach(tensor, BeliefPass(acts=True, stamps=self.online.stamps()[copies]))
+            values = self.predict_values(tensor)
+        if self.online is not None:
+            self.online.note_bootstraps(copies, values)
         for i, info in enumerate(ended):
             info["terminal_observation"] = attach(rows[i], values[i : i + 1])
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_belief.belief import BeliefOutput, HistoryContext, expected_actions
+from sb3_belief.belief import BeliefOutput, expected_actions
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, flatten_observation
 from sb3_belief.export.normalization import Normalization
 
@@ -67,10 +67,10 @@ class PolicyGraph(nn.Module):
             self.normalization = Normalization(statistics)
         extractor = getattr(policy, "features_extractor", None)
         self._extractor = extractor if isinstance(extractor, BeliefExtractor) else None
-        self._context: HistoryContext | None = None
-        if self._extractor is not None and self._extractor.history is not None:
+        self._context: Any = None
+        if self._extractor is not None:
             with th.no_grad():
-                self._context = self._extractor.belief.encode_history(self._extractor.history)
+                self._context = self._extractor.context()
         self._check_policy(type(model).__name__)
 
     @property
@@ -118,7 +118,7 @@ class PolicyGraph(nn.Module):
         else:
             own = self._extractor.features(observation)
             flat = own if self._extractor.from_features else flatten_observation(observation)
-            output = self._extractor.belief(flat, context=self._context)
+            output = self._extractor.infer_from(self._context, flat)
             features = self._extractor.with_belief(own, output)
             believed = self._believed(output)
         distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(features))

@@ -16,7 +16,7 @@ from tests.belief_ppo.toy_envs import AmongOthers, MaskedAmongOthers
 SMALL: dict[str, Any] = dict(n_steps=14, batch_size=14, n_epochs=2, seed=0, history_length=40, keep_ratio=0.1, device="cpu")
 #: Steps of one iteration of a small model with its three environments
 ROLLOUT = 42
-VARIANTS = ["dynamic", "context", "variational", "static", "wide"]
+VARIANTS = ["dynamic", "context", "variational", "static", "wide", "adaptive"]
 ALGORITHMS = [BeliefPPO, MaskableBeliefPPO]
 #: Every variant without masks, but with masks only the one with all parts and the one with none: the belief's code is the same
 EVERY = [*((BeliefPPO, belief) for belief in (*VARIANTS, "none")), (MaskableBeliefPPO, "dynamic"), (MaskableBeliefPPO, "none")]

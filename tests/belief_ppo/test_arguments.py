@@ -139,7 +139,7 @@ def test_a_schedule_that_falls_below_zero_is_refused(name):
 @pytest.mark.parametrize(
     "kwargs, message",
     [
-        (dict(belief="psychic"), "'dynamic', 'context', 'variational', 'static', 'wide', 'none'"),
+        (dict(belief="psychic"), "'dynamic', 'context', 'variational', 'static', 'wide', 'adaptive', 'none'"),
         (dict(action_loss="mae"), "action_loss is 'mae'; it must be one of 'mse', 'cross_entropy'"),
         (dict(policy_latent="mode"), "policy_latent is 'mode'; it must be one of 'sample', 'mean'"),
         (dict(similarity="euclidean"), "similarity is 'euclidean'; it must be one of 'embedding', 'observation'"),

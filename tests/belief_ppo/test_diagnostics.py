@@ -17,6 +17,7 @@ NAMES = {
     "dynamic": ALWAYS | PREDICTING | {"kl", "attention_entropy"},
     "context": ALWAYS | PREDICTING | {"attention_entropy"},
     "variational": ALWAYS | PREDICTING | {"kl"},
+    "adaptive": ALWAYS | PREDICTING | {"attention_entropy"},
     "static": ALWAYS | PREDICTING,
     "wide": ALWAYS,
     "none": set(),
@@ -58,11 +59,12 @@ def test_each_variant_logs_what_it_has(belief, kind):
         if belief == "none":
             continue
         # By construction, not by luck: nothing of a history that is not there can be shuffled
-        without_history = belief not in ("dynamic", "context") or iteration == 0
+        without_history = belief not in ("dynamic", "context", "adaptive") or (iteration == 0 and belief != "adaptive")
         assert (measured["history_gain"] == 0) == without_history
         assert (measured.get("history_gain_rare", 0.0) == 0) == without_history
         if "attention_entropy" in measured:
-            assert (measured["attention_entropy"] == 0) == (iteration == 0)
+            # The adaptive one attends to the first rollout already
+            assert (measured["attention_entropy"] == 0) == (iteration == 0 and belief != "adaptive")
         assert measured["first_log_ratio"] < 1e-5
 
 

@@ -18,7 +18,7 @@ OTHERS: dict[str, spaces.Space] = {
     "e": spaces.Box(-1, 1, (3,), np.float32),
 }
 FINITE = {name: space for name, space in OTHERS.items() if name != "e"}
-PREDICTING = ["dynamic", "context", "variational", "static"]
+PREDICTING = ["dynamic", "context", "variational", "static", "adaptive"]
 
 
 def expected_of(space: spaces.Space, output: np.ndarray, action_loss: str) -> np.ndarray:
@@ -79,6 +79,13 @@ def test_it_shows_the_belief_and_what_it_comes_from(belief):
         assert found.rows.shape == found.weights.shape == (6, 4)  # a tenth of forty
         assert model.policy.history.valid[found.rows].all() and all(len(set(rows)) == 4 for rows in found.rows.tolist())
         assert (found.weights > 0).all()
+        np.testing.assert_allclose(found.weights.sum(axis=1), 1, atol=1e-6)
+    elif belief == "adaptive":
+        # 32 of its own copy, of which there are none, 32 of others, and the null row
+        assert found.rows.shape == found.weights.shape == (6, 65)
+        assert (found.rows[:, :32] == -1).all() and (found.rows[:, 32:-1] >= 0).any() and (found.rows[:, -1] == -1).all()
+        assert model.policy.history.valid[found.rows[found.rows >= 0]].all()
+        assert (found.weights[:, -1] > 0).all() and (found.weights[:, :-1][found.rows[:, :-1] < 0] == 0).all()
         np.testing.assert_allclose(found.weights.sum(axis=1), 1, atol=1e-6)
     else:
         assert found.rows.shape == found.weights.shape == (6, 0)

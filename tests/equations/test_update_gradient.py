@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from torch.nn import functional as F
 
+from sb3_belief.belief.memory import followed_by, valid_rows
 from sb3_belief.belief_ppo import MaskableBeliefPPO
 from sb3_belief.belief_ppo.policies import add_loss
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, VARIANTS, Watch, make_model
@@ -22,6 +23,11 @@ def ppo_loss(model, output) -> th.Tensor:
 
     observations = th.as_tensor(buffer.observations.reshape(ROLLOUT, -1))
     latent = output.latent if model.policy_latent == "sample" else output.mean
+    if model.belief == "adaptive":
+        # It also gives policy and value what it expects of both others
+        assert model.action_loss == "cross_entropy" and output.prediction is not None
+        expected = [output.prediction[:, start:stop].softmax(dim=1) for start, stop in ((0, 3), (3, 7))]
+        latent = th.cat([output.mean, *expected], dim=1)
     latent = latent.detach() if model.detach_belief else latent
     fusion = policy.mlp_extractor
     codes = [
@@ -62,8 +68,9 @@ def belief_loss(model, output, part) -> th.Tensor | float:
 
 
 SWITCHES: list[dict[str, Any]] = [
-    *(dict(belief=variant) for variant in VARIANTS),
-    *(dict(belief=variant, action_loss="cross_entropy") for variant in ("dynamic", "static")),
+    *(dict(belief=variant) for variant in VARIANTS if variant != "adaptive"),
+    *(dict(belief=variant, action_loss="cross_entropy") for variant in ("dynamic", "static", "adaptive")),
+    dict(belief="adaptive", action_loss="cross_entropy", detach_belief=True, history_dropout=0.3),
     dict(policy_latent="mean"),
     dict(detach_belief=True),
     dict(belief="variational", policy_latent="mean", detach_belief=True, action_loss="cross_entropy"),
@@ -84,9 +91,14 @@ def test_gradient_equals_that_of_the_explicit_sum(algorithm, switches):
 
     def look(model):
         part = model.rollout_buffer.belief_minibatch(slice(None))
-        part = type(part)(*(field.reshape(ROLLOUT, -1) for field in part))
+        part = type(part)(*(field.reshape(ROLLOUT, -1) for field in part if field is not None))
         observations = th.as_tensor(model.rollout_buffer.observations.reshape(ROLLOUT, -1))
-        output = model.policy.belief(observations, model.policy.history, part.noise, part.selected)
+        if model.belief == "adaptive":
+            # As the update has it
+            table = followed_by(valid_rows(model.policy.history), model.remembered(0, model.n_steps))
+            output = model.policy.features_extractor.judged(observations, part, table)
+        else:
+            output = model.policy.belief(observations, model.policy.history, part.noise, part.selected)
         ppo, further = ppo_loss(model, output), belief_loss(model, output, part)
         for gradients, loss in ((without_belief, ppo), (explicit, ppo + further)):
             named = dict(model.policy.named_parameters())

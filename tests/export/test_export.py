@@ -41,6 +41,7 @@ CASES = {
         dict(belief="static", use_sde=True),
         dict(others=ANY_OTHERS, action_space=spaces.Box(-1, 1, (2,), np.float32)),
     ),
+    "adaptive": (BeliefPPO, dict(belief="adaptive", action_loss="cross_entropy"), {}),
     "wide, MultiBinary": (
         BeliefPPO,
         dict(belief="wide"),

@@ -1,0 +1,218 @@
+"""The features of an agent whose belief adapts while it plays, and its memory of the rollout under way (issue 20)."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_belief.belief import ActionLayout, BeliefOutput, expected_actions
+from sb3_belief.belief.adaptive import AdaptiveBelief, EncodedMemory
+from sb3_belief.belief.memory import DEPLOYED, Memory, empty_memory, followed_by, newest, valid_rows
+from sb3_belief.belief_ppo.buffers import BeliefMinibatch
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFeatures, BeliefPass
+from sb3_belief.belief_ppo.options import BeliefOptions
+from sb3_belief.common.kept_tensors import KeptTensors
+
+
+class AdaptiveExtractor(BeliefExtractor):
+    """
+    Features of the observation and, beside them, the belief with the actions that it expects of the others.
+
+    What it attends to depends on where it is asked. In a rollout these are the history from before the last update and the
+    rollout's earlier steps (``online``); in the update the same rows (``table``); elsewhere the history.
+
+    :param observation_space: The agent's observation space
+    :param features: Extractor of the features of the observation itself
+    :param belief: The belief network
+    :param options: The user's options of the belief
+    :param from_features: Whether belief and memory see these features instead of the observation itself
+    :param layout: Layout of the others' actions
+    """
+
+    belief: AdaptiveBelief  # type: ignore[assignment]
+    history_own: th.Tensor
+    history_stamps: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        features: BaseFeaturesExtractor,
+        belief: AdaptiveBelief,
+        options: BeliefOptions,
+        from_features: bool,
+        layout: ActionLayout,
+    ) -> None:
+        super().__init__(observation_space, features, belief, options, from_features)  # type: ignore[arg-type]
+        self.layout = layout
+        self.belief_width = belief.latent_dim + layout.width
+        self._features_dim = features.features_dim + self.belief_width
+        #: The memory of the rollout under way; None outside of one
+        self.online: OnlineMemory | None = None
+        #: What the rows of an update attend to; None outside of one
+        self.table: Memory | None = None
+        # Outside of training: the step with which the present episode of each copy began
+        self._began: dict[int, int] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "online": None, "table": None, "_began": {}}
+
+    def _empty_history(self) -> Any:
+        belief = self.belief
+        return empty_memory(self.options.history_length, belief.observation_dim, belief.action_dim, belief.own_dim)
+
+    @property
+    def history(self) -> Memory:  # type: ignore[override]
+        """What the agent remembers outside of a rollout."""
+        return Memory(*(getattr(self, f"history_{name}") for name in Memory._fields))
+
+    def restore_history(self, history: Memory) -> None:  # type: ignore[override]
+        for name, rows in history._asdict().items():
+            setattr(self, f"history_{name}", rows)
+        self._began = {}
+
+    @property
+    def clock(self) -> int:
+        """Number of the next step."""
+        stamps = self.history_stamps[self.history_valid]
+        return int(stamps[:, 0].max()) + 1 if len(stamps) else 0
+
+    def append(self, rows: Memory) -> None:
+        """
+        Append steps to the history.
+
+        :param rows: The steps, oldest first
+        """
+        began = self._began
+        self.restore_history(newest(followed_by(self.history, rows), self.options.history_length))
+        self._began = began
+
+    def remember_steps(self, observations: th.Tensor, actions: th.Tensor, own: th.Tensor, copies: np.ndarray | None) -> None:
+        """
+        Append steps outside of training.
+
+        :param observations: Preprocessed flat observations, oldest first, ``[N, d_o]``
+        :param actions: The others' actions at those steps, zero where not visible, ``[N, W]``
+        :param own: Own actions and rewards, ``[N, U + 1]``
+        :param copies: Of which copy each step is, from 0, all of one joint step, int ``[N]``; None for successive steps of one
+        """
+        now, n = self.clock, len(observations)
+        times = np.arange(now, now + n) if copies is None else np.full(n, now)
+        places = np.full(n, DEPLOYED) if copies is None else DEPLOYED - copies
+        stamps = np.stack([times, places, [self._began.get(int(place), -1) for place in places]], axis=1)
+        self.append(Memory(observations, actions, own, th.as_tensor(stamps), actions.any(dim=1)))
+
+    def end_episodes(self, copies: np.ndarray) -> None:
+        """
+        Have what follows belong to other episodes than what was remembered outside of training.
+
+        :param copies: In which copies, int ``[n]`` from 0
+        """
+        self._began.update({DEPLOYED - int(copy): self.clock for copy in copies})
+
+    def present_stamps(self, n: int) -> th.Tensor:
+        """
+        Return the stamps of observations outside of training, of which the i-th is of copy i.
+
+        :param n: Their number
+        :return: int64 ``[n, 3]``
+        """
+        now = self.clock
+        rows = [(now, DEPLOYED - copy, self._began.get(DEPLOYED - copy, -1)) for copy in range(n)]
+        return th.tensor(rows, dtype=th.int64, device=self.history_stamps.device).reshape(n, 3)
+
+    def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:
+        if belief_pass.selected is not None:
+            assert self.table is not None and belief_pass.stamps is not None
+            return self.belief(flat, belief_pass.stamps, self.belief.encode(self.table), belief_pass.selected)
+        if self.online is None or not belief_pass.acts:
+            return self.infer(flat)
+        stamps = self.online.stamps() if belief_pass.stamps is None else belief_pass.stamps
+        memory, selected = self.online.encoded(), None
+        if belief_pass.sample and self.options.history_dropout:
+            # Some passes see the null row only, so that neither belief nor policy relies on a memory that may be empty
+            selected = self.belief.select(flat, stamps, memory)
+            dropped = th.rand(len(flat), 1, device=flat.device) < self.options.history_dropout
+            selected = selected.masked_fill(dropped, -1)
+        return self.belief(flat, stamps, memory, selected)
+
+    def infer(  # type: ignore[override]
+        self, flat: th.Tensor, noise: None = None, selected: None = None, predict: bool = True
+    ) -> BeliefOutput:
+        """
+        Infer the belief from the history.
+
+        :param flat: Preprocessed flat observations, ``[B, d_o]``
+        :param noise: None: the belief is a point
+        :param selected: None: the rows of the highest scores
+        :param predict: The prediction is part of the features, so it is made in any case
+        :return: The belief
+        """
+        return self.belief(flat, self.present_stamps(len(flat)), self.belief.encode(valid_rows(self.history)))
+
+    def context(self) -> tuple[EncodedMemory, th.Tensor]:
+        return self.belief.encode(valid_rows(self.history)), self.present_stamps(1)
+
+    def infer_from(self, context: Any, flat: th.Tensor) -> BeliefOutput:
+        # All of them as observations of one copy
+        memory, stamps = context
+        return self.belief(flat, stamps.expand(flat.shape[0], -1), memory)
+
+    def attended(self) -> Memory:  # type: ignore[override]
+        assert self.table is not None
+        return self.table
+
+    def judged(self, flat: th.Tensor, minibatch: BeliefMinibatch, history: Any = None) -> BeliefOutput:
+        memory = self.belief.encode(history or self.attended())
+        return self.belief(flat, minibatch.stamps, memory, minibatch.selected)
+
+    def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures | th.Tensor:
+        assert output.prediction is not None
+        expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
+        return self._beside(own, th.cat([output.mean, expected], dim=-1))
+
+
+class OnlineMemory:
+    """
+    What an agent remembers in its rollout: the history from before the last update, and the rollout's earlier steps.
+
+    :param model: The agent's model, whose rollout buffer is empty
+    """
+
+    def __init__(self, model: Any):
+        self._model, self._buffer = model, model.rollout_buffer
+        extractor: AdaptiveExtractor = model.policy.features_extractor
+        self._belief, self._clock = extractor.belief, extractor.clock
+        self._frozen = valid_rows(extractor.history)
+        self._encoded: EncodedMemory | None = None
+        self._n_steps, self._weights = 0, KeptTensors()
+        self._stamps, self._stamped = th.zeros(0), -1
+
+    def stamps(self) -> th.Tensor:
+        """Return the stamps of the present observations of all copies, int64 ``[n_envs, 3]``."""
+        if self._stamped != self._buffer.pos:
+            starts = np.asarray(self._model._last_episode_starts, dtype=bool)
+            stamps = self._buffer.stamp(self._clock + self._buffer.pos, starts)
+            self._stamps, self._stamped = th.as_tensor(stamps, device=self._model.device), self._buffer.pos
+        return self._stamps
+
+    def note_bootstraps(self, copies: list[int], values: th.Tensor) -> None:
+        """
+        Note what SB3 is about to add to rewards at time limits, which the agent has not got.
+
+        :param copies: The copies whose episodes were cut off
+        :param values: Values of their last observations, ``[n, 1]``
+        """
+        self._buffer.bootstraps[copies] = self._buffer.gamma * values.cpu().numpy().flatten()
+
+    @th.no_grad()
+    def encoded(self) -> EncodedMemory:
+        """Return the encoded memory. With each step only its own rows are encoded."""
+        if self._encoded is None or self._weights.changed(self._belief.context_parameters()):
+            self._encoded, self._n_steps = self._belief.encode(self._frozen), 0
+        if self._n_steps < self._buffer.pos:
+            new = self._belief.encode(self._model.remembered(self._n_steps, self._buffer.pos))
+            self._encoded = EncodedMemory(*(th.cat([a, b]) for a, b in zip(self._encoded, new, strict=True)))
+            self._n_steps = self._buffer.pos
+        return self._encoded

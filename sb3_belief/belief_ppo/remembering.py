@@ -1,0 +1,157 @@
+"""What a policy with a belief remembers, in training and when it is deployed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_belief.belief import DynamicBelief, History
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, flat_observations
+from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
+from sb3_belief.belief_ppo.others import others_rows
+from sb3_belief.common.action_encoding import RowEncoder
+
+# Of how many observations the features are computed at a time
+_FEATURE_ROWS = 64
+
+
+class RememberingMixin(BeliefNetworksMixin):
+    """The part of :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin` by which algorithm and users reach its memory."""
+
+    @property
+    def _extractor(self) -> BeliefExtractor:
+        assert isinstance(self.features_extractor, BeliefExtractor)
+        return self.features_extractor
+
+    @property
+    def belief(self) -> DynamicBelief | None:
+        """The belief network, if there is one."""
+        return self._extractor.belief if self.has_belief else None
+
+    @property
+    def history(self) -> History | None:
+        """The history from which the belief is inferred at present, if there is a belief that has one."""
+        return self._extractor.history if self.has_belief else None
+
+    @property
+    def online(self) -> OnlineMemory | None:
+        """The memory of the rollout under way, if there is one and the belief is online."""
+        return self._extractor.online if self.has_belief and isinstance(self._extractor, AdaptiveExtractor) else None
+
+    def restore_history(self, history: History) -> None:
+        """
+        Put an earlier history back, to forget what was remembered since.
+
+        :param history: A value that :attr:`history` had
+        """
+        self._extractor.restore_history(history)
+
+    def remember(
+        self,
+        observations: np.ndarray | dict[str, np.ndarray],
+        actions: np.ndarray | Mapping[str, Any],
+        visible: Mapping[str, Any] | None = None,
+        own_actions: np.ndarray | None = None,
+        rewards: np.ndarray | None = None,
+        copies: np.ndarray | None = None,
+    ) -> None:
+        """
+        Append the agent's own active steps to its history, which is all that it needs to adapt to other teammates.
+
+        The algorithm does so after each update; for a deployed agent its user does. A belief without a history remembers
+        nothing.
+
+        :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
+        :param actions: What the others did at these steps: ``{name: actions}``, each ``[N, ...]`` in that other's own space,
+            without the others that were not visible at any; or all flattened and side by side, ``[N, W]``, zero where not
+            visible, as in ``info["others_actions"]``
+        :param visible: ``{name: bool [N]}``, at which of the steps each other was visible; at all of them if it is left out.
+            What stands in ``actions`` at the other steps is ignored
+        :param own_actions: What the agent itself did, ``[N, ...]`` in its own space; zeros if it is left out. This and what
+            follows is for the adaptive belief alone
+        :param rewards: Its own rewards, ``[N]``; zeros if they are left out
+        :param copies: Where the agent acts in several copies of an environment at once, as in an evaluation: of which copy
+            each row is, int ``[N]`` from 0, all of one step. :meth:`predict` takes the i-th of its observations for one of
+            copy i. None if these are successive steps of one copy
+        :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
+            is not finite
+        """
+        if self.history is None:
+            return
+        # A tensor that is made in inference mode could never be trained on
+        with th.inference_mode(False), th.no_grad():
+            # obs_to_tensor() accepts images with the channels last, as the environment returns them
+            rows = self.flat_observations(self.obs_to_tensor(observations)[0])
+            if not bool(th.isfinite(rows).all()):
+                raise ValueError(
+                    "observations to remember hold a number that is not finite: attention to such a row would make all later "
+                    "actions NaN; leave these steps out"
+                )
+            encoded = others_rows(self.others_action_spaces, actions, visible, len(rows))
+            actions_seen = th.as_tensor(encoded, device=self.device)
+            if not isinstance(self._extractor, AdaptiveExtractor):
+                self._extractor.remember(rows, actions_seen)
+                return
+            if copies is not None:
+                copies = np.asarray(copies)
+                if copies.shape != (len(rows),) or copies.dtype.kind != "i" or (copies < 0).any():
+                    raise ValueError(f"copies must be integers of at least 0 of the shape {(len(rows),)}, not {copies!r}")
+            own = th.as_tensor(self.own_rows(own_actions, rewards, len(rows)), device=self.device)
+            self._extractor.remember_steps(rows, actions_seen, own, copies)
+
+    def own_rows(self, actions: np.ndarray | None, rewards: np.ndarray | None, n_steps: int) -> np.ndarray:
+        """
+        Return the agent's own part of some steps, as an adaptive belief remembers it.
+
+        :param actions: Its actions, ``[N, ...]``; None for zeros
+        :param rewards: Its rewards, ``[N]``; None for zeros
+        :param n_steps: ``N``
+        :return: float32 ``[N, U + 1]``
+        :raises ValueError: If one of them has another shape, or is not finite
+        """
+        encoder = RowEncoder("the agent", self.action_space)
+        own = np.zeros((n_steps, encoder.width + 1), dtype=np.float32)
+        for name, given, shape, columns in (
+            ("own_actions", actions, (n_steps, *(self.action_space.shape or ())), slice(0, -1)),
+            ("rewards", rewards, (n_steps,), slice(-1, None)),
+        ):
+            if given is None:
+                continue
+            values = np.asarray(given)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise ValueError(f"{name} must be finite numbers of the shape {shape}, not {values!r}")
+            own[:, columns] = encoder(values) if name == "own_actions" else values[:, None]
+        return own
+
+    def end_episodes(self, copies: np.ndarray | None = None) -> None:
+        """
+        Tell a deployed agent that an episode has ended: what follows is another one. Only the adaptive belief knows of them.
+
+        :param copies: In which copies, as of :meth:`remember`, int ``[n]``; None for its only one
+        """
+        if self.has_belief and isinstance(self._extractor, AdaptiveExtractor):
+            self._extractor.end_episodes(np.zeros(1, dtype=int) if copies is None else copies)
+
+    def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        Convert observations to what belief and history take: preprocessed as SB3 does and flat, or their features.
+
+        :param observations: Observations as the environment returns them, batch first
+        :return: ``[B, d_o]``
+        """
+        if not (self.has_belief and self._extractor.from_features):
+            return flat_observations(self, observations)
+        self.set_training_mode(False)
+        # A few at a time: the images of a whole history would take gigabytes as floats
+        parts = observations if isinstance(observations, dict) else {"": observations}
+        features = []
+        with th.no_grad():
+            for rows in zip(*(part.split(_FEATURE_ROWS) for part in parts.values()), strict=True):
+                some: Any = dict(zip(parts, rows, strict=True))
+                some = some if isinstance(observations, dict) else some[""]
+                features.append(self._extractor.features(preprocess_obs(some, self.observation_space, self.normalize_images)))
+        return th.cat(features)

@@ -1,0 +1,206 @@
+"""A belief that adapts while it plays: what it remembers of the rollout under way, and of what an agent does when deployed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_belief.belief.memory import DEPLOYED, valid_rows
+from sb3_belief.belief_ppo import BeliefPPO
+from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, SMALL, make_model, observations_of, same_parameters
+from tests.belief_ppo.test_update import check_log_ratios
+
+ADAPTIVE: dict[str, Any] = dict(belief="adaptive", n_own=3, n_pool=4)
+N_ENVS, N_STEPS = 3, SMALL["n_steps"]
+
+
+def adaptive(**kwargs: Any) -> Any:
+    return make_model(**{**ADAPTIVE, **kwargs})
+
+
+class Kept(BaseCallback):
+    """Callback that keeps what the environment gave in each step, and at the end of each rollout what was attended to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rewards: list[np.ndarray] = []
+        self.actions: list[np.ndarray] = []
+        self.rollouts: list[dict[str, Any]] = []
+
+    def _on_step(self) -> bool:
+        # SB3 adds values to the array at time limits
+        self.rewards.append(self.locals["rewards"].copy())
+        self.actions.append(self.locals["actions"].copy())
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        buffer = model.rollout_buffer
+        self.rollouts.append(
+            {
+                "frozen": valid_rows(model.policy.history),
+                "selected": buffer.selected.copy(),
+                "stamps": buffer.stamps.copy(),
+                "valid": buffer.active & buffer.attended_visible.any(axis=-1),
+            }
+        )
+
+
+@pytest.mark.parametrize("inactive", [0, 3])
+def test_each_step_attends_to_earlier_ones_only(inactive):
+    kept = Kept()
+    adaptive(env_kwargs=dict(inactive=inactive)).learn(3 * ROLLOUT, callback=kept)
+    for number, rollout in enumerate(kept.rollouts):
+        frozen, n_frozen = rollout["frozen"], len(rollout["frozen"].valid)
+        assert (n_frozen > 0) == (number > 0)
+        _, copies = np.divmod(np.arange(N_STEPS * N_ENVS), N_ENVS)
+        copy_of = np.concatenate([frozen.stamps[:, 1].numpy(), copies])
+        is_valid = np.concatenate([frozen.valid.numpy(), rollout["valid"].reshape(-1)])
+        met = 0
+        for t in range(N_STEPS):
+            for copy in range(N_ENVS):
+                rows = rollout["selected"][t, copy]
+                own, pool = (part[part >= 0] for part in (rows[:3], rows[3:7]))
+                assert rows[7] == -1 and (copy_of[own] == copy).all() and (copy_of[pool] != copy).all()
+                both = np.concatenate([own, pool])
+                assert is_valid[both].all() and (both < n_frozen + t * N_ENVS).all()
+                met += int((both >= n_frozen).sum())
+        assert met > N_STEPS
+        # The steps are numbered through all rollouts
+        assert (rollout["stamps"][..., 1] == np.arange(N_ENVS)).all()
+        assert (np.diff(rollout["stamps"][..., 0], axis=0) == 1).all()
+        assert not len(frozen.stamps) or frozen.stamps[:, 0].max() < rollout["stamps"][0, 0, 0]
+        # Episodes of seven steps
+        assert (rollout["stamps"][..., 0] - rollout["stamps"][..., 2] == np.arange(N_STEPS)[:, None] % 7).all()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_memory_holds_what_the_agent_did_and_got(algorithm):
+    kept = Kept()
+    model = adaptive(algorithm=algorithm, history_length=ROLLOUT, env_kwargs=dict(visible=1.0)).learn(
+        2 * ROLLOUT, callback=kept
+    )
+    history = model.policy.history
+    # The last rollout, its episodes' ends included, without the values that SB3 adds to rewards at time limits
+    np.testing.assert_allclose(history.own[:, -1], np.concatenate(kept.rewards[N_STEPS:]), atol=1e-5)
+    assert np.array_equal(history.own[:, :-1].argmax(dim=1), np.concatenate(kept.actions[N_STEPS:]))
+    bootstrapped = model.rollout_buffer.rewards.reshape(N_ENVS, N_STEPS).T.reshape(-1)
+    assert not np.allclose(history.own[:, -1], bootstrapped, atol=1e-3)
+
+
+SWITCHES: list[dict[str, Any]] = [
+    {},
+    dict(n_own=0),
+    dict(n_pool=0),
+    dict(n_own=200, n_pool=200),
+    dict(history_dropout=0.5),
+    dict(row_features=["reward", "episode"]),
+    dict(action_loss="cross_entropy"),
+    dict(detach_belief=True),
+    dict(history_length=4),
+]
+
+
+@pytest.mark.parametrize("inactive", [0, 3])
+@pytest.mark.parametrize("switches", SWITCHES, ids=str)
+def test_the_ratio_starts_at_one(switches, inactive):
+    check_log_ratios(adaptive(env_kwargs=dict(inactive=inactive), learning_rate=1e-2, **switches), n_iterations=3)
+
+
+def test_dropped_steps_see_the_null_row_only():
+    kept = Kept()
+    adaptive(n_steps=200, batch_size=600, n_epochs=1, history_dropout=0.25).learn(2 * 600, callback=kept)
+    nothing = (kept.rollouts[1]["selected"] < 0).all(axis=-1)
+    # Four standard errors of 600 draws
+    assert abs(nothing.mean() - 0.25) < 0.07
+
+
+def test_memories_differ_by_copy():
+    """What one copy's partner did is told apart from what another's did."""
+    model = adaptive().learn(2 * ROLLOUT)
+    obs = observations_of(model, 1)
+    policy = model.policy
+    for copy in (0, 1):
+        policy.remember(np.repeat(obs, 2, axis=0)[:1], {"b": np.array([copy]), "c": np.array([copy])}, copies=np.array([copy]))
+    policy.restore_history(policy.history)
+    first, second = policy.predict_others(np.repeat(obs, 2, axis=0)).rows
+    length = int(policy.history.valid.sum())
+    assert length - 2 in first[:3] and length - 1 not in first[:3]
+    assert length - 1 in second[:3] and length - 2 not in second[:3]
+
+
+def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
+    model = adaptive().learn(ROLLOUT)
+    policy, before = model.policy, model.policy.history
+    clock = policy.features_extractor.clock
+    obs = observations_of(model, 3)
+    seen = {"b": np.array([0, 1, 2])}
+    policy.remember(obs, seen, own_actions=np.array([2, 0, 1]), rewards=np.array([0.5, 0.0, -1.0]))
+    policy.end_episodes()
+    policy.remember(obs[:1], {"c": 3})
+    rows = valid_rows(policy.history)
+    assert rows.stamps[-4:].tolist() == [
+        *([clock + i, DEPLOYED, -1] for i in range(3)),
+        [clock + 3, DEPLOYED, clock + 3],
+    ]
+    assert rows.own[-4:].tolist() == [[0, 0, 1, 0.5], [1, 0, 0, 0], [0, 1, 0, -1], [0, 0, 0, 0]]
+    assert rows.actions[-4:].argmax(dim=1).tolist() == [0, 1, 2, 6]
+    # A step at which nobody was seen says nothing
+    policy.remember(obs[:1], {})
+    assert int(policy.history.valid.sum()) == len(rows.valid)
+    policy.restore_history(before)
+    assert policy.features_extractor.clock == clock
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(own_actions=np.zeros(2)), r"own_actions must be .* shape \(1,\)"),
+        (dict(rewards=np.zeros((1, 1))), r"rewards must be .* shape \(1,\)"),
+        (dict(rewards=np.array([np.nan])), r"rewards must be finite"),
+        (dict(copies=np.zeros(2, dtype=int)), r"copies must be .* shape \(1,\)"),
+        (dict(copies=np.array([-1])), r"copies must be"),
+    ],
+)
+def test_what_cannot_be_remembered_is_refused(kwargs, message):
+    model = adaptive().learn(ROLLOUT)
+    before = model.policy.history
+    with pytest.raises(ValueError, match=message):
+        model.policy.remember(observations_of(model, 1), {"b": 1}, **kwargs)
+    assert all(th.equal(a, b) for a, b in zip(before, model.policy.history, strict=True))
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(n_own=-1), "n_own=-1 must be an integer >= 0"),
+        (dict(n_pool=1.5), "n_pool=1.5 must be an integer"),
+        (dict(n_own=0, n_pool=0), "nothing would be attended to"),
+        (dict(history_dropout=1.0), r"history_dropout is 1.0; it must be in \[0, 1\)"),
+        (dict(row_features=["rewards"]), "row_features: an entry is 'rewards'; it must be one of 'own_action', 'reward'"),
+        (dict(row_features="reward"), "row_features is 'reward'"),
+    ],
+)
+def test_wrong_arguments(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        adaptive(**kwargs)
+
+
+def test_a_saved_model_goes_on_as_it_would_have(tmp_path):
+    model = adaptive(row_features=["age", "copy"], history_dropout=0.1).learn(2 * ROLLOUT)
+    model.save(tmp_path / "model.zip")
+    loaded = BeliefPPO.load(tmp_path / "model.zip", device="cpu")
+    assert same_parameters(model, loaded)
+    assert model.policy.options.row_features == ("age", "copy") and loaded.policy.options == model.policy.options
+    obs = observations_of(model, 4)
+    assert np.array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    for name, expected in model.policy.predict_others(obs).actions.items():
+        assert np.array_equal(expected, loaded.policy.predict_others(obs).actions[name])
+
+
+def test_the_rollout_does_not_outlive_its_end():
+    model = adaptive().learn(ROLLOUT)
+    extractor = model.policy.features_extractor
+    assert extractor.online is None and extractor.table is None
