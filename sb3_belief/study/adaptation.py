@@ -154,7 +154,7 @@ def _without_history(contender: _Contender, meeting: Meeting) -> str:
     found = ", ".join(f"{agent}: {type(meeting.team.agents[agent]).__name__}" for agent in meeting.agents)
     return (
         f"{_COMMAND}: nobody in {str(contender.path)!r} has a belief that a history feeds, so observing changes nothing for"
-        f" them ({found}). Give it as --blind to a team that has: belief='dynamic' or 'context'."
+        f" them ({found}). Give it as --blind to a team that has: belief='adaptive', 'dynamic' or 'context'."
     )
 
 

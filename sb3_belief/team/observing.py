@@ -18,11 +18,17 @@ from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
 
 class _Seen(NamedTuple):
-    """What an agent observed of a step: its observations when it acted, the others' actions ``[n, W]``, and where it acted."""
+    """
+    What an agent observed of a step: its observations when it acted, the others' actions ``[n, W]``, where it acted, its own
+    actions and rewards, and where its return has ended.
+    """
 
     obs: Any
     others_actions: np.ndarray
     active: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
 
 
 class ObservingVecEnv(VecEnvWrapper):
@@ -87,8 +93,16 @@ class ObservingVecEnv(VecEnvWrapper):
         if self.most_steps is not None:
             rows = rows[: self.most_steps - self.steps[agent]]
         if len(rows):
-            self._policies[agent].remember(map_parts(lambda part: part[rows], seen.obs), seen.others_actions[rows])
+            self._policies[agent].remember(
+                map_parts(lambda part: part[rows], seen.obs),
+                seen.others_actions[rows],
+                own_actions=seen.actions[rows],
+                rewards=seen.rewards[rows],
+                copies=rows,
+            )
             self.steps[agent] += len(rows)
+        if seen.dones.any():
+            self._policies[agent].end_episodes(np.flatnonzero(seen.dones))
 
 
 class _ObservingTeam(ObservingVecEnv):
@@ -102,17 +116,18 @@ class _ObservingTeam(ObservingVecEnv):
 
     def _seen(self, step: Any) -> dict[str, _Seen]:
         transitions = dict(zip(self._agents, self._splitter.transitions(self._actions, step), strict=True))
-        return {
-            agent: _Seen(
-                self._team.observed_by(agent, self._obs[agent]), transitions[agent].others_actions, transitions[agent].active
-            )
-            for agent in self._policies
-        }
+        seen = {}
+        for agent in self._policies:
+            own = transitions[agent]
+            obs, did = self._team.observed_by(agent, self._obs[agent]), np.asarray(self._actions[agent])
+            rewards = self._team.rewarded_by(agent, own.rewards)
+            seen[agent] = _Seen(obs, own.others_actions, own.active, did, rewards, own.dones)
+        return seen
 
 
 class _ObservingLearner(ObservingVecEnv):
     def _seen(self, step: Any) -> dict[str, _Seen]:
-        infos = step[3]
+        _, rewards, dones, infos = step
         try:
             others_actions = np.stack([info["others_actions"] for info in infos])
             active = np.array([info["active"] for info in infos])
@@ -120,7 +135,8 @@ class _ObservingLearner(ObservingVecEnv):
             raise ValueError(
                 f"The infos of the environment lack {error.args[0]!r}, so there is nothing to observe: use an AgentEnv."
             ) from None
-        return {agent: _Seen(self._obs, others_actions, active) for agent in self._policies}
+        seen = _Seen(self._obs, others_actions, active, np.asarray(self._actions), rewards, dones)
+        return dict.fromkeys(self._policies, seen)
 
 
 @contextmanager
@@ -171,7 +187,7 @@ def observing(
         found = ", ".join(f"{agent}: {type(each).__name__}" for agent, each in models.items())
         raise ValueError(
             "Nobody here has a belief that a history feeds, so observing would change nothing: it takes a BeliefPPO with"
-            f" belief='dynamic' or 'context' and others to observe. The models are {found}."
+            f" belief='adaptive', 'dynamic' or 'context' and others to observe. The models are {found}."
         )
     observed: ObservingVecEnv
     if isinstance(model, Team):

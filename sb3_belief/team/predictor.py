@@ -59,6 +59,14 @@ class Predictor:
         """
         return obs if self._statistics is None else self._statistics.normalize_obs(obs)
 
+    def rewarded(self, rewards: np.ndarray) -> np.ndarray:
+        """
+        Return rewards as the model gets them in training: normalised, if it is.
+
+        :param rewards: Rewards as the team's environment returns them
+        """
+        return rewards if self._statistics is None else self._statistics.normalize_reward(rewards)
+
     def predict(
         self,
         obs: np.ndarray,

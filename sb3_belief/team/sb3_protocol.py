@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -171,6 +172,16 @@ class SB3Protocol:
         :return: The same, normalised if the team is
         """
         return self._agents.predictor(agent).observed(observation)
+
+    def rewarded_by(self, agent: str, rewards: np.ndarray) -> np.ndarray:
+        """
+        Return an agent's rewards as its model gets them in training.
+
+        :param agent: Name of the agent
+        :param rewards: Its own, as the team's environment returns them, ``[n_envs]``
+        :return: The same, normalised if the team is
+        """
+        return self._agents.predictor(agent).rewarded(rewards)
 
     def get_vec_normalize_env(self) -> VecNormalize | None:
         """Return None: each agent is normalised by itself, not the environment."""

@@ -104,7 +104,8 @@ def _view(agent: AgentMoment, moment: Moment, others: Sequence[str], encodings: 
         ]
         view["error"] = [None if error is None else _number(error) for _, error in judged]
         rows = sorted(zip(agent.prediction.weights.tolist(), agent.prediction.rows.tolist(), strict=True), reverse=True)
-        view["rows"] = [[row, round(weight, 5)] for weight, row in rows]
+        # The null row of an adaptive belief has no step behind it
+        view["rows"] = [[row, round(weight, 5)] for weight, row in rows if row >= 0]
     return view
 
 
@@ -144,7 +145,7 @@ def _agent(agent: str, recording: Recording, encodings: dict[str, ActionEncoding
     if history is None or not bool(history.valid.any()):
         return described
     # Of the rows that no card shows, the page needs the weight only
-    shown = sorted({int(row) for each in predictions for row in each.rows[np.argsort(-each.weights)[:CARDS]]})
+    shown = sorted({int(row) for each in predictions for row in each.rows[np.argsort(-each.weights)[:CARDS]] if row >= 0})
     filled = int(history.valid.sum())
     columns = [encodings[other] for other in others]
     remembered = history.observations.cpu().numpy()[shown]

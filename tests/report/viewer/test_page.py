@@ -168,3 +168,16 @@ def test_beliefs_without_a_history_and_none(belief):
     assert ("expects" in view) == (belief == "static") and "cards" not in data["agents"]["several"]
     assert data["agents"]["several"].get("belief") == (belief if belief == "static" else None)
     assert view["own"]["kind"] == "probabilities"
+
+
+def test_the_null_row_of_an_adaptive_belief_is_no_step():
+    recording = recorded(*trained(belief="adaptive"), episodes=1)
+    data = page_data(recording, "")
+    shares = []
+    for moment, step in pairs(recording, data):
+        for agent, mine in moment.agents.items():
+            rows = dict(step["views"][agent]["rows"])
+            assert -1 not in rows and set(rows) == {int(row) for row in mine.prediction.rows if row >= 0}
+            shares.append(sum(rows.values()))
+    assert 0 < min(shares) and max(shares) < 1
+    assert all(card["age"] > 0 for agent in data["agents"].values() for card in agent["cards"].values())

@@ -1,0 +1,73 @@
+"""Teams whose agents adapt while they play: resumed, in worker processes, and while they are evaluated."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_belief import BeliefPPO
+from sb3_belief import team as sb3_team
+from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
+from tests.team.toy_envs import BlinkingEnv
+
+observing: Any = sb3_team.observing
+ADAPTIVE: dict[str, Any] = {
+    **PPO_KWARGS,
+    "belief": "adaptive",
+    "history_length": 40,
+    "n_own": 4,
+    "n_pool": 4,
+    "history_dropout": 0.2,
+    "policy_kwargs": {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4},
+}
+
+
+def learned(steps, jobs=1, **kwargs):
+    env = make_team_env(BlinkingEnv, n_envs=2, seed=0)
+    return Team(BeliefPPO, "BeliefPolicy", env, seed=0, jobs=jobs, **{**ADAPTIVE, **kwargs}).learn(steps)
+
+
+def same(a, b):
+    return all(np.array_equal(parameters(a.agents[name]), parameters(b.agents[name])) for name in a.agents)
+
+
+def histories(team):
+    return {
+        (name, field): rows.numpy().tobytes()
+        for name, model in team.agents.items()
+        for field, rows in model.policy.history._asdict().items()
+    }
+
+
+def test_agents_in_worker_processes_learn_the_same():
+    here, there = learned(96), learned(96, jobs=2)
+    assert same(here, there) and histories(here) == histories(there)
+
+
+def test_a_training_goes_on_exactly(tmp_path):
+    whole = learned(96)
+    half = learned(48)
+    half.save(tmp_path / "half.zip", exact=True)
+    env = make_team_env(BlinkingEnv, n_envs=2, seed=0)
+    resumed = Team.load(tmp_path / "half.zip", env=env, exact=True)
+    resumed.learn(48, reset_num_timesteps=False)
+    assert same(whole, resumed) and histories(whole) == histories(resumed)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_what_is_observed_goes_into_the_memory_of_its_copy(normalize):
+    team = learned(48, normalize=normalize)
+    before = histories(team)
+    env = make_team_env(BlinkingEnv, n_envs=3, seed=5)
+    with observing(team, env) as watched:
+        evaluate_policy(team, watched, n_eval_episodes=6)
+        for model in team.agents.values():
+            rows = model.policy.history
+            own = rows.own[rows.valid & (rows.stamps[:, 1] < 0)]
+            stamps = rows.stamps[rows.valid & (rows.stamps[:, 1] < 0)]
+            assert set(stamps[:, 1].tolist()) == {-1, -2, -3}
+            # Several episodes of each copy, each by its beginning
+            assert all(len(set(stamps[stamps[:, 1] == copy, 2].tolist())) > 1 for copy in (-1, -2, -3))
+            assert own[:, :-1].any(dim=1).all() and own[:, -1].any()
+    assert histories(team) == before
