@@ -21,6 +21,7 @@ Parts:
 - ``partners``: one learner among nine partners: a pool of saved teams against one, and functions of batches against the
   callables of an ``AgentEnv`` (benchmarks/partners.py)
 - ``scripted``: one learner among nine scripted cars in one batch, against nine callables (benchmarks/scripted.py)
+- ``adaptive``: one learner with an adaptive belief against one with the paper's and one without (benchmarks/adaptive.py)
 - ``gpu``: updates on a GPU against the CPU, where there is a GPU
 
 torch uses one thread. Speeds are joint steps (of one copy) per second of CPU time, including that of workers, and per second
@@ -34,7 +35,7 @@ from pathlib import Path
 
 import torch as th
 
-from benchmarks import acting, checkpoints, cores, finite, gpu, growth, heavy, memory, partners, scripted
+from benchmarks import acting, adaptive, checkpoints, cores, finite, gpu, growth, heavy, memory, partners, scripted
 from benchmarks.measure import Loop, Sample, ratio
 from benchmarks.report import Report
 from benchmarks.teams import (
@@ -115,6 +116,7 @@ PARTS: dict[str, Callable[[Report], None]] = {
     "checkpoints": checkpoints.run,
     "partners": partners.run,
     "scripted": scripted.run,
+    "adaptive": adaptive.run,
     "gpu": gpu.run,
 }
 

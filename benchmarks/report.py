@@ -33,6 +33,8 @@ BARS: dict[str, tuple[str, float]] = {
     "pool_vs_one_team": (">=", 0.5),
     "pool_per_copy_vs_one_team": (">=", 0.5),
     "partners_vs_agent_env": (">=", 10.0),
+    "adaptive_vs_dynamic": (">=", 0.75),
+    "adaptive_vs_ippo": (">=", 0.5),
 }
 #: The same of peak memory, in MiB
 PEAK_BARS: dict[str, tuple[str, float]] = {"junction belief_ppo": ("<", 1536.0)}

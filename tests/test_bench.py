@@ -22,7 +22,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict:
     bench.main(
         [
             *("--quick", "--out", str(out), "--parts"),
-            *("a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "partners", "scripted"),
+            *("a", "b", "c", "together", "d", "cores", "finite", "checkpoints", "partners", "scripted", "adaptive"),
         ]
     )
     return json.loads(Path(out).read_text())
