@@ -17,6 +17,7 @@ def test_all_are_there():
     aisles = ["aisle_sides", "aisle_sides_each_rollout", "aisle_sides_stationary", "aisle_sides_unseen"]
     assert NAMES == [
         "ablations",
+        "adaptive",
         *aisles,
         "changing_teammates_gate",
         "convention",
