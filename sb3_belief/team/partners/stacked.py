@@ -1,9 +1,9 @@
 """
 The members of a pool that act at the same time, as one pass.
 
-Where each copy draws its own member, a pass for each would take most of its time for calls. With four saved teams as nine partners
-in 32 copies the environment makes three times as many steps per CPU second in one (benchmarks/partners.py: 0.87 times those of a
-single team, instead of 0.31).
+Where each copy draws its own member, a pass for each would take most of its time for calls. With four saved teams as nine
+partners in 32 copies the environment makes three times as many steps per CPU second in one (benchmarks/partners.py: 0.87
+times those of a single team, instead of 0.31).
 """
 
 from collections.abc import Sequence
