@@ -113,13 +113,16 @@ class AdaptiveExtractor(BeliefExtractor):
 
     def present_stamps(self, n: int) -> th.Tensor:
         """
-        Return the stamps of observations outside of training, of which the i-th is of copy i.
+        Return the stamps of observations outside of training, of which the i-th is of copy i; of the first copy, if nothing
+        of copy i is remembered: an agent that has observed in one copy may be evaluated in many.
 
         :param n: Their number
         :return: int64 ``[n, 3]``
         """
         now = self.clock
-        rows = [(now, DEPLOYED - copy, self._began.get(DEPLOYED - copy, -1)) for copy in range(n)]
+        remembered = set(self.history_stamps[self.history_valid, 1].tolist())
+        places = [DEPLOYED - copy if DEPLOYED - copy in remembered else DEPLOYED for copy in range(n)]
+        rows = [(now, place, self._began.get(place, -1)) for place in places]
         return th.tensor(rows, dtype=th.int64, device=self.history_stamps.device).reshape(n, 3)
 
     def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:

@@ -125,10 +125,12 @@ def test_memories_differ_by_copy():
     for copy in (0, 1):
         policy.remember(np.repeat(obs, 2, axis=0)[:1], {"b": np.array([copy]), "c": np.array([copy])}, copies=np.array([copy]))
     policy.restore_history(policy.history)
-    first, second = policy.predict_others(np.repeat(obs, 2, axis=0)).rows
+    first, second, third = policy.predict_others(np.repeat(obs, 3, axis=0)).rows
     length = int(policy.history.valid.sum())
     assert length - 2 in first[:3] and length - 1 not in first[:3]
     assert length - 1 in second[:3] and length - 2 not in second[:3]
+    # A copy of which nothing is remembered is taken for the first one
+    assert np.array_equal(first, third)
 
 
 def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
