@@ -1,12 +1,13 @@
 """The attention's own backward pass, against the graph that PyTorch records."""
 
+import math
 import subprocess
 import sys
 
 import pytest
 import torch as th
 
-from sb3_belief.belief.attention import attend, reference_attention, topk_indices
+from sb3_belief.belief.attention import attend, attend_beside_null, reference_attention, topk_indices
 
 
 def plain(queries, keys, values, kept):
@@ -151,3 +152,31 @@ def test_stacked_agents_attend_each_to_its_own_rows(n_selected):
         th.testing.assert_close(weights[i], expected[1])
         for ours, theirs in zip(found, th.autograd.grad(expected[0].square().sum(), own) if n_selected else (), strict=True):
             th.testing.assert_close(ours[i], theirs)
+
+
+@pytest.mark.parametrize("n_rows", [3, 30])
+def test_attention_beside_a_null_row_equals_its_definition(n_rows):
+    """Values and gradients, with rows that take no part; also where more rows are selected than there are."""
+    generator = th.Generator().manual_seed(0)
+    b, n, d = 7, 6, 5
+    queries, rows, bias, null, weighting = (
+        th.randn(*shape, generator=generator, dtype=th.double) for shape in ((b, d), (n_rows, d), (b, n), (b,), (b, n + 1))
+    )
+    selected = th.randint(n_rows, (b, n), generator=generator).int()
+    bias[0, :] = -math.inf
+    bias[1, 2:] = -math.inf
+    inputs = [each.requires_grad_() for each in (queries, rows, bias, null)]
+
+    scores = th.cat([(queries[:, None] * rows[selected.long()]).sum(dim=-1) + bias, null[:, None]], dim=1)
+    weights = scores.softmax(dim=-1)
+    sums = (weights[:, :-1, None] * rows[selected.long()]).sum(dim=1)
+    expected = th.autograd.grad((sums.square().sum() + (weights * weighting).sum()), inputs)
+    found_sums, found_weights = attend_beside_null(*inputs, selected)
+    found = th.autograd.grad((found_sums.square().sum() + (found_weights * weighting).sum()), inputs)
+    assert th.allclose(found_sums, sums) and th.allclose(found_weights, weights)
+    # Nothing is known of a row that takes no part but its bias, whose gradient is zero
+    for a, e in zip(found, expected, strict=True):
+        assert th.allclose(a, e.nan_to_num())
+    with th.no_grad():
+        acting = attend_beside_null(*inputs, selected)
+    assert th.allclose(acting[0], sums) and th.allclose(acting[1], weights)

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief.belief.memory import DEPLOYED, valid_rows
 from sb3_belief.belief_ppo import BeliefPPO
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, SMALL, make_model, observations_of, same_parameters
+from tests.belief_ppo.test_no_leak import ACTIONS, OBSERVATIONS
 from tests.belief_ppo.test_update import check_log_ratios
 
 ADAPTIVE: dict[str, Any] = dict(belief="adaptive", n_own=3, n_pool=4)
@@ -206,3 +207,10 @@ def test_the_rollout_does_not_outlive_its_end():
     model = adaptive().learn(ROLLOUT)
     extractor = model.policy.features_extractor
     assert extractor.online is None and extractor.table is None
+
+
+@pytest.mark.parametrize("observations", ["image", "dict", "discrete"])
+@pytest.mark.parametrize("actions", ["box", "multi-discrete", "multi-binary"])
+def test_any_spaces(observations, actions):
+    env_kwargs = dict(observation_space=OBSERVATIONS[observations], action_space=ACTIONS[actions])
+    check_log_ratios(adaptive(env_kwargs=env_kwargs, learning_rate=1e-2), n_iterations=2)
