@@ -167,7 +167,7 @@ class BeliefBufferMixin(_Buffer):
         self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
         self._is_online = is_online
         # In each copy, the number of the step with which the present episode began
-        self._began = np.zeros(0, dtype=np.int64)
+        self._began: list[int] = []
         super().__init__(*args, **kwargs)
         self._cut_returns = CutReturns(self.n_envs, self.gamma)
 
@@ -258,7 +258,9 @@ class BeliefBufferMixin(_Buffer):
         :param starts: Whether an episode starts with it, bool ``[n_envs]``
         :return: As of :class:`~sb3_belief.belief.memory.Memory`, int64 ``[n_envs, 3]``
         """
-        self._began = np.where(starts, now, self._began if len(self._began) else now)
+        self._began = [
+            now if is_start else began for is_start, began in zip(starts, self._began or [now] * self.n_envs, strict=True)
+        ]
         stamps = np.stack([np.full(self.n_envs, now), np.arange(self.n_envs), self._began], axis=1)
         # After a rollout its last observations are asked for, which are the first of the next
         if self.pos < self.buffer_size:
