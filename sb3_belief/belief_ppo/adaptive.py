@@ -1,6 +1,7 @@
 """The features of an agent whose belief adapts while it plays, and its memory of the rollout under way (issue 20)."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -14,6 +15,9 @@ from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFeatures, BeliefPass
 from sb3_belief.belief_ppo.options import BeliefOptions
 from sb3_belief.common.kept_tensors import KeptTensors
+
+#: How many steps of each rollout are replayed
+REPLAYED_ROWS = 256
 
 
 class AdaptiveExtractor(BeliefExtractor):
@@ -52,11 +56,13 @@ class AdaptiveExtractor(BeliefExtractor):
         self.online: OnlineMemory | None = None
         #: What the rows of an update attend to; None outside of one
         self.table: Memory | None = None
+        #: Past rollouts on which the belief is trained in an update as well; see :func:`replayed`
+        self.replay: list[Replayed] = []
         # Outside of training: the step with which the present episode of each copy began
         self._began: dict[int, int] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "online": None, "table": None, "_began": {}}
+        return {**super().__getstate__(), "online": None, "table": None, "replay": [], "_began": {}}
 
     def _empty_history(self) -> Any:
         belief = self.belief
@@ -174,6 +180,48 @@ class AdaptiveExtractor(BeliefExtractor):
         assert output.prediction is not None
         expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
         return self._beside(own, th.cat([output.mean, expected], dim=-1))
+
+
+class Replayed(NamedTuple):
+    """
+    Some steps of a past rollout, with what the agent remembered then.
+
+    :param table: What it attended to
+    :param flat: Its preprocessed flat observations, ``[B, d_o]``
+    :param minibatch: The rows that it attended to, and what the others did
+    """
+
+    table: Memory
+    flat: th.Tensor
+    minibatch: BeliefMinibatch
+
+
+def to_be_replayed(table: Memory, flat: th.Tensor, minibatch: BeliefMinibatch) -> dict[str, np.ndarray]:
+    """
+    Return steps of a rollout as a rollout buffer keeps them, and a checkpoint saves them.
+
+    :param table: What they attended to
+    :param flat: Their preprocessed flat observations, ``[B, d_o]``
+    :param minibatch: Their part of the belief
+    :return: Arrays by name
+    """
+    parts = {f"table_{name}": rows for name, rows in table._asdict().items()}
+    parts |= {f"minibatch_{name}": rows for name, rows in minibatch._asdict().items()}
+    return {name: rows.cpu().numpy().copy() for name, rows in {**parts, "flat": flat}.items()}
+
+
+def replayed(kept: Mapping[str, np.ndarray], device: th.device) -> Replayed:
+    """
+    Return steps of a past rollout as the belief takes them.
+
+    :param kept: As of :func:`to_be_replayed`
+    :param device: Device of the policy
+    :return: The steps
+    """
+    tensors = {name: th.as_tensor(rows, device=device) for name, rows in kept.items()}
+    table = Memory(*(tensors[f"table_{name}"] for name in Memory._fields))
+    minibatch = BeliefMinibatch(*(tensors[f"minibatch_{name}"] for name in BeliefMinibatch._fields))
+    return Replayed(table, tensors["flat"], minibatch)
 
 
 class OnlineMemory:

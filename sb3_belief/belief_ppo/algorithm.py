@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_selected
 from sb3_belief.belief.memory import Memory, followed_by, valid_rows
-from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
+from sb3_belief.belief_ppo.adaptive import REPLAYED_ROWS, AdaptiveExtractor, OnlineMemory, replayed, to_be_replayed
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.extractor import fitting_extractor
@@ -70,6 +70,7 @@ class BeliefAlgorithmMixin(_Algorithm):
     n_pool: int
     row_features: tuple[str, ...]
     history_dropout: float
+    belief_replay: int
     #: Whether the belief sees features unless policy_kwargs say otherwise. Models saved before it could do not
     belief_from_features: bool
     action_coef: float | Schedule
@@ -282,6 +283,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         extractor = policy.features_extractor
         if isinstance(extractor, AdaptiveExtractor):
             extractor.table = followed_by(valid_rows(extractor.history), self.remembered(0, buffer.buffer_size))
+            extractor.replay = [replayed(kept, policy.device) for kept in buffer.replay]
         else:
             observations, actions = buffer.recent(self.history_length)
         for name, value in measure_belief(policy, buffer).items():
@@ -290,7 +292,12 @@ class BeliefAlgorithmMixin(_Algorithm):
         if learns:
             self._update()
         if isinstance(extractor, AdaptiveExtractor):
-            extractor.table = None
+            if self.belief_replay:
+                # Drawn as SB3 draws minibatches
+                rows = buffer.rows_of(np.random.permutation(buffer.active_steps())[:REPLAYED_ROWS])
+                part = policy.flat_observations(self._observations(rows)), buffer.belief_minibatch(rows)
+                buffer.replay = [*buffer.replay, to_be_replayed(extractor.table, *part)][-self.belief_replay :]
+            extractor.table, extractor.replay = None, []
             extractor.append(self.remembered(0, buffer.buffer_size, is_over=True))
         else:
             policy.remember(observations, actions)
@@ -313,6 +320,12 @@ class BeliefAlgorithmMixin(_Algorithm):
         finally:
             extractor.online = None
 
+    def _observations(self, rows: tuple[np.ndarray, ...]) -> Any:
+        """Return the observations of some rows of the rollout."""
+        raw: Any = self.rollout_buffer.observations
+        seen = {key: part[rows] for key, part in raw.items()} if isinstance(raw, dict) else raw[rows]
+        return obs_as_tensor(seen, self.policy.device)
+
     @th.no_grad()
     def remembered(self, first: int, last: int, is_over: bool = False) -> Memory:
         """
@@ -326,9 +339,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         """
         buffer, policy = self.rollout_buffer, self.policy
         rows = buffer.rows_of(np.arange(first * self.n_envs, last * self.n_envs))
-        raw: Any = buffer.observations
-        seen = {key: part[rows] for key, part in raw.items()} if isinstance(raw, dict) else raw[rows]
-        flat = policy.flat_observations(obs_as_tensor(seen, policy.device))
+        flat = policy.flat_observations(self._observations(rows))
         actions = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ()))
         own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
         seen_actions, visible = buffer.attended_actions, buffer.attended_visible

@@ -81,6 +81,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param row_features: Of ``"adaptive"``: what a step in its memory tells beside the agent's observation and what it saw the
         others do, of ``"own_action"``, ``"reward"``, ``"age"``, ``"episode"`` (whether it is of the same one) and ``"copy"``
     :param history_dropout: Of ``"adaptive"``: share of the steps in training at which it sees nothing of its memory, in [0, 1)
+    :param belief_replay: Of ``"adaptive"``: on how many past rollouts its predictions are trained as well, at least 0, so that
+        its weights do not learn the present teammates by heart
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -137,6 +139,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
+        belief_replay: int = 0,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -179,6 +182,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             n_pool=n_pool,
             row_features=row_features,
             history_dropout=history_dropout,
+            belief_replay=belief_replay,
         )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:

@@ -168,6 +168,8 @@ class BeliefBufferMixin(_Buffer):
         self._is_online = is_online
         # In each copy, the number of the step with which the present episode began
         self._began: list[int] = []
+        #: What the belief is trained on besides, of the past rollouts
+        self.replay: list[dict[str, np.ndarray]] = []
         super().__init__(*args, **kwargs)
         self._cut_returns = CutReturns(self.n_envs, self.gamma)
 

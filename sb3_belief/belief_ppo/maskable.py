@@ -100,6 +100,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param n_pool: As in BeliefPPO
     :param row_features: As in BeliefPPO
     :param history_dropout: As in BeliefPPO
+    :param belief_replay: As in BeliefPPO
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -154,6 +155,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
+        belief_replay: int = 0,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -194,6 +196,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             n_pool=n_pool,
             row_features=row_features,
             history_dropout=history_dropout,
+            belief_replay=belief_replay,
         )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:

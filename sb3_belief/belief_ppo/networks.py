@@ -46,6 +46,7 @@ class BeliefNetworksMixin(_Policy):
     :param n_pool: As in :class:`~sb3_belief.BeliefPPO`
     :param row_features: As in :class:`~sb3_belief.BeliefPPO`
     :param history_dropout: As in :class:`~sb3_belief.BeliefPPO`
+    :param belief_replay: As in :class:`~sb3_belief.BeliefPPO`
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
@@ -75,6 +76,7 @@ class BeliefNetworksMixin(_Policy):
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
+        belief_replay: int = 0,
         embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
@@ -94,6 +96,7 @@ class BeliefNetworksMixin(_Policy):
             n_pool=n_pool,
             row_features=row_features,
             history_dropout=history_dropout,
+            belief_replay=belief_replay,
         )
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, Integral) or width < 1:

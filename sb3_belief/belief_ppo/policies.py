@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, expected_actions, kl_divergence
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
 from sb3_belief.belief_ppo.extractor import BeliefPass
 from sb3_belief.belief_ppo.others import OthersPrediction
@@ -195,6 +196,8 @@ class BeliefPolicyMixin(RememberingMixin):
             values, log_prob, entropy = super().evaluate_actions(attach(obs, belief_pass), actions, *args, **kwargs)
         assert belief_pass.output is not None
         loss = self.belief_loss(belief_pass.output, minibatch)
+        if isinstance(self._extractor, AdaptiveExtractor) and self._extractor.replay:
+            loss = loss + self._replayed_loss(self._extractor)
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 
     def belief_loss(self, belief: BeliefOutput, minibatch: BeliefMinibatch) -> th.Tensor | None:
@@ -211,6 +214,13 @@ class BeliefPolicyMixin(RememberingMixin):
         if self._extractor.belief.variant.samples:
             loss = loss + self.kl_coef * kl_divergence(belief.mean, belief.log_std)
         return loss
+
+    def _replayed_loss(self, extractor: AdaptiveExtractor) -> th.Tensor:
+        """Return the belief's loss on steps of a past rollout, with the history as it was then."""
+        past = extractor.replay[np.random.randint(len(extractor.replay))]
+        output = extractor.judged(past.flat, past.minibatch, past.table)
+        assert output.prediction is not None
+        return self.action_coef * self.action_error(output.prediction, past.minibatch)
 
     def action_error(self, prediction: th.Tensor, minibatch: BeliefMinibatch) -> th.Tensor:
         """

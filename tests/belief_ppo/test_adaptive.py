@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief.belief.memory import DEPLOYED, valid_rows
 from sb3_belief.belief_ppo import BeliefPPO
+from sb3_belief.belief_ppo.adaptive import replayed
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, SMALL, make_model, observations_of, same_parameters
 from tests.belief_ppo.test_no_leak import ACTIONS, OBSERVATIONS
 from tests.belief_ppo.test_update import check_log_ratios
@@ -97,6 +98,7 @@ SWITCHES: list[dict[str, Any]] = [
     dict(n_pool=0),
     dict(n_own=200, n_pool=200),
     dict(history_dropout=0.5),
+    dict(belief_replay=2),
     dict(row_features=["reward", "episode"]),
     dict(action_loss="cross_entropy"),
     dict(detach_belief=True),
@@ -181,6 +183,7 @@ def test_what_cannot_be_remembered_is_refused(kwargs, message):
         (dict(n_own=-1), "n_own=-1 must be an integer >= 0"),
         (dict(n_pool=1.5), "n_pool=1.5 must be an integer"),
         (dict(n_own=0, n_pool=0), "nothing would be attended to"),
+        (dict(belief_replay=-1), "belief_replay=-1 must be an integer >= 0"),
         (dict(history_dropout=1.0), r"history_dropout is 1.0; it must be in \[0, 1\)"),
         (dict(row_features=["rewards"]), "row_features: an entry is 'rewards'; it must be one of 'own_action', 'reward'"),
         (dict(row_features="reward"), "row_features is 'reward'"),
@@ -203,10 +206,42 @@ def test_a_saved_model_goes_on_as_it_would_have(tmp_path):
         assert np.array_equal(expected, loaded.policy.predict_others(obs).actions[name])
 
 
+def test_past_rollouts_are_replayed():
+    model = adaptive(belief_replay=2).learn(3 * ROLLOUT)
+    kept = model.rollout_buffer.replay
+    last = [int(part["minibatch_stamps"][:, 0].max()) for part in kept]
+    # The last two of three, with the tables of then: their own steps are the last rows
+    assert last == [2 * N_STEPS - 1, 3 * N_STEPS - 1]
+    for part, end in zip(kept, last, strict=True):
+        assert part["table_stamps"][:, 0].max() == end and len(part["flat"]) == ROLLOUT
+        # A step attends to earlier ones only
+        selected, stamps = part["minibatch_selected"], part["minibatch_stamps"]
+        ages = stamps[:, None, 0] - part["table_stamps"][selected.clip(min=0), 0]
+        assert (ages[selected >= 0] > 0).all()
+
+
+def test_a_replay_trains_the_belief_and_leaves_policy_and_value_alone():
+    model = adaptive(belief_replay=1).learn(2 * ROLLOUT)
+    extractor = model.policy.features_extractor
+    extractor.replay = [replayed(kept, model.device) for kept in model.rollout_buffer.replay]
+    model.policy.optimizer.zero_grad()
+    model.policy._replayed_loss(extractor).backward()
+    trained = {name for name, weight in model.policy.named_parameters() if weight.grad is not None and weight.grad.any()}
+    assert "features_extractor.belief.decoder.weight" in trained and "features_extractor.belief.key.weight" in trained
+    assert all(name.startswith("features_extractor.belief.") for name in trained)
+    # The loss is that of the prediction which was made then
+    past = extractor.replay[0]
+    output = extractor.judged(past.flat, past.minibatch, past.table)
+    expected = model.policy.action_coef * model.policy.action_error(output.prediction, past.minibatch)
+    assert th.equal(model.policy._replayed_loss(extractor), expected)
+    # And it makes a difference
+    assert not same_parameters(model, adaptive().learn(2 * ROLLOUT))
+
+
 def test_the_rollout_does_not_outlive_its_end():
     model = adaptive().learn(ROLLOUT)
     extractor = model.policy.features_extractor
-    assert extractor.online is None and extractor.table is None
+    assert extractor.online is None and extractor.table is None and extractor.replay == []
 
 
 @pytest.mark.parametrize("observations", ["image", "dict", "discrete"])
