@@ -165,7 +165,8 @@ class AdaptiveBelief(nn.Module):
     def _highest_scores(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> th.Tensor:
         of_age, of_episode, of_copy = (self.pair_score.weight[0] * self.pair_mask).unbind()
         # The copies of a rollout are all at the same step
-        now = stamps[:1] if bool((stamps[:, 0] == stamps[0, 0]).all()) else stamps
+        at_once = not th.compiler.is_compiling() and bool((stamps[:, 0] == stamps[0, 0]).all())
+        now = stamps[:1] if at_once else stamps
         same_copy = stamps[:, 1:2] == memory.stamps[:, 1]
         same_episode = same_copy & (stamps[:, 2:] == memory.stamps[:, 2])
         scores = query @ memory.states.mT + of_age * _ages(now[:, :1], memory.stamps[:, 0])

@@ -296,7 +296,7 @@ class BeliefAlgorithmMixin(_Algorithm):
                 # Drawn as SB3 draws minibatches
                 rows = buffer.rows_of(np.random.permutation(buffer.active_steps())[:REPLAYED_ROWS])
                 part = policy.flat_observations(self._observations(rows)), buffer.belief_minibatch(rows)
-                buffer.replay = [*buffer.replay, to_be_replayed(extractor.table, *part)][-self.belief_replay :]
+                buffer.replay = [*buffer.replay, to_be_replayed(extractor.attended(), *part)][-self.belief_replay :]
             extractor.table, extractor.replay = None, []
             extractor.append(self.remembered(0, buffer.buffer_size, is_over=True))
         else:

@@ -14,9 +14,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, expected_actions, kl_divergence
-from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
-from sb3_belief.belief_ppo.extractor import BeliefPass
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass
 from sb3_belief.belief_ppo.others import OthersPrediction
 from sb3_belief.belief_ppo.remembering import RememberingMixin
 
@@ -97,6 +97,16 @@ class BeliefPolicyMixin(RememberingMixin):
         if self.optimizer_class is th.optim.Adam:
             self.optimizer_kwargs = _fused_adam_kwargs(self.optimizer_kwargs)
         super()._build(lr_schedule)
+
+    @property
+    def _extractor(self) -> BeliefExtractor:  # type: ignore[override]
+        assert isinstance(self.features_extractor, BeliefExtractor)
+        return self.features_extractor
+
+    @property
+    def online(self) -> OnlineMemory | None:
+        """The memory of the rollout under way, if there is one and the belief is online."""
+        return self._extractor.online if self.has_belief and isinstance(self._extractor, AdaptiveExtractor) else None
 
     # -- SB3's passes --------------------------------------------------------------------------------------------------
 
@@ -197,6 +207,7 @@ class BeliefPolicyMixin(RememberingMixin):
         assert belief_pass.output is not None
         loss = self.belief_loss(belief_pass.output, minibatch)
         if isinstance(self._extractor, AdaptiveExtractor) and self._extractor.replay:
+            assert loss is not None
             loss = loss + self._replayed_loss(self._extractor)
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_belief.belief import DynamicBelief, History
-from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
+from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, flat_observations
 from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
 from sb3_belief.belief_ppo.others import others_rows
@@ -22,10 +22,8 @@ _FEATURE_ROWS = 64
 class RememberingMixin(BeliefNetworksMixin):
     """The part of :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin` by which algorithm and users reach its memory."""
 
-    @property
-    def _extractor(self) -> BeliefExtractor:
-        assert isinstance(self.features_extractor, BeliefExtractor)
-        return self.features_extractor
+    #: Its features extractor
+    _extractor: BeliefExtractor
 
     @property
     def belief(self) -> DynamicBelief | None:
@@ -36,11 +34,6 @@ class RememberingMixin(BeliefNetworksMixin):
     def history(self) -> History | None:
         """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
-
-    @property
-    def online(self) -> OnlineMemory | None:
-        """The memory of the rollout under way, if there is one and the belief is online."""
-        return self._extractor.online if self.has_belief and isinstance(self._extractor, AdaptiveExtractor) else None
 
     def restore_history(self, history: History) -> None:
         """

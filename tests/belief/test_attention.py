@@ -171,12 +171,12 @@ def test_attention_beside_a_null_row_equals_its_definition(n_rows):
     weights = scores.softmax(dim=-1)
     sums = (weights[:, :-1, None] * rows[selected.long()]).sum(dim=1)
     expected = th.autograd.grad((sums.square().sum() + (weights * weighting).sum()), inputs)
-    found_sums, found_weights = attend_beside_null(*inputs, selected)
+    found_sums, found_weights = attend_beside_null(queries, rows, bias, null, selected)
     found = th.autograd.grad((found_sums.square().sum() + (found_weights * weighting).sum()), inputs)
     assert th.allclose(found_sums, sums) and th.allclose(found_weights, weights)
     # Nothing is known of a row that takes no part but its bias, whose gradient is zero
     for a, e in zip(found, expected, strict=True):
         assert th.allclose(a, e.nan_to_num())
     with th.no_grad():
-        acting = attend_beside_null(*inputs, selected)
+        acting = attend_beside_null(queries, rows, bias, null, selected)
     assert th.allclose(acting[0], sums) and th.allclose(acting[1], weights)
