@@ -117,6 +117,7 @@ class AdaptiveBelief(nn.Module):
         stamps: th.Tensor,
         memory: EncodedMemory,
         selected: th.Tensor | None = None,
+        dropped: th.Tensor | None = None,
     ) -> BeliefOutput:
         """
         Infer the belief.
@@ -126,6 +127,7 @@ class AdaptiveBelief(nn.Module):
         :param memory: What the agent remembers
         :param selected: The rows to attend to, as returned before, int32 ``[B, n_own + n_pool + 1]``; None to select those of
             the highest scores
+        :param dropped: Which observations see the null row only, bool ``[B]``; None for none of them
         :return: The belief. Rows beyond those that there are have the number -1 and no weight; the last is the null row, also
             -1
         """
@@ -137,7 +139,9 @@ class AdaptiveBelief(nn.Module):
         # With keys and values the states are multiplied here, and not the many rows of the memory
         in_states = query @ (self.key.weight / math.sqrt(self.embedding_dim))
         if selected is None:
-            selected = self._highest_scores(in_states, stamps, memory)
+            selected = self._select(in_states, stamps, memory)
+        if dropped is not None:
+            selected = selected.masked_fill(dropped[:, None], -1)
         rows = selected[:, :-1].clamp(min=0)
         pairs = self._pairs(stamps, memory.stamps[rows.long()])
         bias = self.pair_score(pairs).squeeze(-1).masked_fill(selected[:, :-1] < 0, -math.inf)
@@ -148,21 +152,13 @@ class AdaptiveBelief(nn.Module):
         return BeliefOutput(mean, mean, th.full_like(mean, -math.inf), self.decoder(mean), selected, weights)
 
     @th.no_grad()
-    def select(self, observations: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> th.Tensor:
+    def _select(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> th.Tensor:
         """
         Select the rows of the highest scores, which is discrete: no gradient flows through it.
 
-        :param observations: ``[B, d_o]``
-        :param stamps: Of the observations, int64 ``[B, 3]``
-        :param memory: What the agent remembers
         :return: The rows of the same copy, then those of others, then the null row, int32 ``[B, n_own + n_pool + 1]``; -1 for
             none
         """
-        query = self.query(self.observation_embedding(observations)) @ (self.key.weight / math.sqrt(self.embedding_dim))
-        return self._highest_scores(query, stamps, memory)
-
-    @th.no_grad()
-    def _highest_scores(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> th.Tensor:
         of_age, of_episode, of_copy = (self.pair_score.weight[0] * self.pair_mask).unbind()
         # The copies of a rollout are all at the same step
         at_once = not th.compiler.is_compiling() and bool((stamps[:, 0] == stamps[0, 0]).all())

@@ -138,13 +138,11 @@ class AdaptiveExtractor(BeliefExtractor):
         if self.online is None or not belief_pass.acts:
             return self.infer(flat)
         stamps = self.online.stamps() if belief_pass.stamps is None else belief_pass.stamps
-        memory, selected = self.online.encoded(), None
+        dropped = None
         if belief_pass.sample and self.options.history_dropout:
             # Some passes see the null row only, so that neither belief nor policy relies on a memory that may be empty
-            selected = self.belief.select(flat, stamps, memory)
-            dropped = th.rand(len(flat), 1, device=flat.device) < self.options.history_dropout
-            selected = selected.masked_fill(dropped, -1)
-        return self.belief(flat, stamps, memory, selected)
+            dropped = th.rand(len(flat), device=flat.device) < self.options.history_dropout
+        return self.belief(flat, stamps, self.online.encoded(), dropped=dropped)
 
     def infer(  # type: ignore[override]
         self, flat: th.Tensor, noise: None = None, selected: None = None, predict: bool = True

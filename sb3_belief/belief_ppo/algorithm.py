@@ -16,7 +16,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_selected
@@ -24,7 +24,7 @@ from sb3_belief.belief.memory import Memory, followed_by, valid_rows
 from sb3_belief.belief_ppo.adaptive import REPLAYED_ROWS, AdaptiveExtractor, OnlineMemory, replayed, to_be_replayed
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
-from sb3_belief.belief_ppo.extractor import fitting_extractor
+from sb3_belief.belief_ppo.extractor import fitting_extractor, rollout_rows
 from sb3_belief.belief_ppo.memory import holds_images, warn_of_memory
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
@@ -295,7 +295,10 @@ class BeliefAlgorithmMixin(_Algorithm):
             if self.belief_replay:
                 # Drawn as SB3 draws minibatches
                 rows = buffer.rows_of(np.random.permutation(buffer.active_steps())[:REPLAYED_ROWS])
-                part = policy.flat_observations(self._observations(rows)), buffer.belief_minibatch(rows)
+                part = (
+                    policy.flat_observations(rollout_rows(buffer.observations, rows, policy.device)),
+                    buffer.belief_minibatch(rows),
+                )
                 buffer.replay = [*buffer.replay, to_be_replayed(extractor.attended(), *part)][-self.belief_replay :]
             extractor.table, extractor.replay = None, []
             extractor.append(self.remembered(0, buffer.buffer_size, is_over=True))
@@ -320,12 +323,6 @@ class BeliefAlgorithmMixin(_Algorithm):
         finally:
             extractor.online = None
 
-    def _observations(self, rows: tuple[np.ndarray, ...]) -> Any:
-        """Return the observations of some rows of the rollout."""
-        raw: Any = self.rollout_buffer.observations
-        seen = {key: part[rows] for key, part in raw.items()} if isinstance(raw, dict) else raw[rows]
-        return obs_as_tensor(seen, self.policy.device)
-
     @th.no_grad()
     def remembered(self, first: int, last: int, is_over: bool = False) -> Memory:
         """
@@ -339,7 +336,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         """
         buffer, policy = self.rollout_buffer, self.policy
         rows = buffer.rows_of(np.arange(first * self.n_envs, last * self.n_envs))
-        flat = policy.flat_observations(self._observations(rows))
+        flat = policy.flat_observations(rollout_rows(buffer.observations, rows, policy.device))
         actions = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ()))
         own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
         seen_actions, visible = buffer.attended_actions, buffer.attended_visible

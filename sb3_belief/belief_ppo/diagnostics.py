@@ -5,11 +5,10 @@ import math
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_belief.belief import ActionLayout, kl_divergence
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch, attach
-from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion
+from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, rollout_rows
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 
 # Enough for two significant digits, at a small part of an update's time
@@ -41,8 +40,7 @@ def measure_belief(policy: BeliefPolicyMixin, buffer: BeliefBufferMixin) -> dict
     steps = buffer.active_steps()
     step = buffer.rows_of(steps[np.linspace(0, len(steps) - 1, min(PROBE_ROWS, len(steps))).astype(int)])
     minibatch = buffer.belief_minibatch(step)
-    raw = buffer.observations
-    observations = obs_as_tensor({k: v[step] for k, v in raw.items()} if isinstance(raw, dict) else raw[step], policy.device)
+    observations = rollout_rows(buffer.observations, step, policy.device)
     flat = policy.flat_observations(observations)
 
     belief, variant = policy.belief, policy.options.variant

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -15,6 +16,7 @@ from stable_baselines3.common.torch_layers import (
     NatureCNN,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
+from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_belief.belief import BeliefOutput, DynamicBelief, History, HistoryContext, append_rows, empty_history
@@ -63,6 +65,18 @@ def flat_observations(policy: BasePolicy, observations: PyTorchObs) -> th.Tensor
     :return: ``[B, d_o]``
     """
     return flatten_observation(preprocess_obs(observations, policy.observation_space, policy.normalize_images))
+
+
+def rollout_rows(observations: Any, rows: tuple[np.ndarray, ...], device: th.device) -> PyTorchObs:
+    """
+    Return some rows of a rollout's observations as tensors.
+
+    :param observations: Of the rollout buffer: an array, or a dict of arrays
+    :param rows: Index into its first dimensions, as of ``BeliefBufferMixin.rows_of``
+    :param device: Device of the tensors
+    """
+    is_dict = isinstance(observations, dict)
+    return obs_as_tensor({k: v[rows] for k, v in observations.items()} if is_dict else observations[rows], device)
 
 
 @dataclass(slots=True)

@@ -41,6 +41,8 @@ class StackedMembers:
         self._predictors = predictors
         policies: list[Any] = [predictor.model.policy for predictor in predictors]
         self._policy = policies[0]
+        # Otherwise all of them see the same
+        self._normalizes = any(predictor.normalizes for predictor in predictors)
         self._network = stack([policy.mlp_extractor.policy_net for policy in policies])
         self._logits = StackedLinear([policy.action_net for policy in policies])
 
@@ -56,15 +58,10 @@ class StackedMembers:
         :return: The actions, ``[n_envs, ...]``
         """
         policy = self._policy
-        inputs = [
-            flat_observations(policy, policy.obs_to_tensor(seen)[0])
-            for seen in (
-                [predictor.observed(obs) for predictor in self._predictors]
-                if any(predictor.normalizes for predictor in self._predictors)
-                else [obs]
-            )
-        ]
-        flat = th.stack(inputs).expand(len(self._predictors), -1, -1)
+        seen = [predictor.observed(obs) for predictor in self._predictors] if self._normalizes else [obs]
+        flat = th.stack([flat_observations(policy, policy.obs_to_tensor(each)[0]) for each in seen]).expand(
+            len(self._predictors), -1, -1
+        )
         logits = self._logits(self._network(flat))[th.as_tensor(present), th.arange(len(present))]
         distribution = policy.action_dist.proba_distribution(action_logits=logits)
         if masks is not None and isinstance(distribution, MaskableDistribution):
