@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_belief.belief.attention import attend_beside_null
-from sb3_belief.belief.memory import Memory
+from sb3_belief.belief.memory import Memory, valid_rows
 from sb3_belief.belief.network import BeliefOutput
 from sb3_belief.belief.variants import ADAPTIVE
 
@@ -110,6 +110,15 @@ class AdaptiveBelief(nn.Module):
         events = th.cat([memory.actions, memory.own * self.own_mask], dim=-1)
         states = self.observation_embedding(memory.observations) + self.event_embedding(events)
         return EncodedMemory(states, memory.stamps, memory.valid)
+
+    def encode_history(self, history: Memory) -> EncodedMemory:
+        """
+        Encode a history, of which not all rows need be filled.
+
+        :param history: The agent's history
+        :return: Its valid rows as states
+        """
+        return self.encode(valid_rows(history))
 
     def forward(
         self,

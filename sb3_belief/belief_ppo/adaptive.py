@@ -156,10 +156,12 @@ class AdaptiveExtractor(BeliefExtractor):
         :param predict: The prediction is part of the features, so it is made in any case
         :return: The belief
         """
-        return self.belief(flat, self.present_stamps(len(flat)), self.belief.encode(valid_rows(self.history)))
+        # Kept while nothing is remembered or learned, but for a pass that needs gradients
+        memory = self.belief.encode_history(self.history) if th.is_grad_enabled() else self.encoded(self.history)  # type: ignore
+        return self.belief(flat, self.present_stamps(len(flat)), memory)
 
     def context(self) -> tuple[EncodedMemory, th.Tensor]:
-        return self.belief.encode(valid_rows(self.history)), self.present_stamps(1)
+        return super().context(), self.present_stamps(1)
 
     def infer_from(self, context: Any, flat: th.Tensor) -> BeliefOutput:
         # All of them as observations of one copy
