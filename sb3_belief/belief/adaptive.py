@@ -11,7 +11,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_belief.belief.attention import attend_beside_null
+from sb3_belief.belief.attention import attend_beside_null, sum_beside_null, topk_indices
 from sb3_belief.belief.memory import Memory, valid_rows
 from sb3_belief.belief.network import BeliefOutput
 from sb3_belief.belief.variants import ADAPTIVE
@@ -147,39 +147,50 @@ class AdaptiveBelief(nn.Module):
         query = self.query(embedding)
         # With keys and values the states are multiplied here, and not the many rows of the memory
         in_states = query @ (self.key.weight / math.sqrt(self.embedding_dim))
+        scores = None
         if selected is None:
-            selected = self._select(in_states, stamps, memory)
+            selected, scores = self._select(in_states, stamps, memory)
         if dropped is not None:
             selected = selected.masked_fill(dropped[:, None], -1)
+        nothing = selected[:, :-1] < 0
         rows = selected[:, :-1].clamp(min=0)
         pairs = self._pairs(stamps, memory.stamps[rows.long()])
-        bias = self.pair_score(pairs).squeeze(-1).masked_fill(selected[:, :-1] < 0, -math.inf)
         null = query @ self.null_key / math.sqrt(self.embedding_dim)
-        state, weights = attend_beside_null(in_states, memory.states, bias, null, rows)
+        if scores is None or th.is_grad_enabled():
+            bias = self.pair_score(pairs).squeeze(-1).masked_fill(nothing, -math.inf)
+            state, weights = attend_beside_null(in_states, memory.states, bias, null, rows)
+        else:
+            # While acting the scores are known from the selection
+            state, weights = sum_beside_null(memory.states, scores.masked_fill(nothing, -math.inf), null, rows)
         summary = self.value(state) + self.pair_value((weights[:, :-1, None] * pairs).sum(dim=1))
         mean = self.encoder(embedding + summary + weights[:, -1:] * self.null_value)
         return BeliefOutput(mean, mean, th.full_like(mean, -math.inf), self.decoder(mean), selected, weights)
 
-    @th.no_grad()
-    def _select(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> th.Tensor:
+    def _select(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> tuple[th.Tensor, th.Tensor]:
         """
         Select the rows of the highest scores, which is discrete: no gradient flows through it.
 
         :return: The rows of the same copy, then those of others, then the null row, int32 ``[B, n_own + n_pool + 1]``; -1 for
-            none
+            none; and the scores of all but the null row, ``[B, n_own + n_pool]``
         """
-        of_age, of_episode, of_copy = (self.pair_score.weight[0] * self.pair_mask).unbind()
+        of_age, of_episode, of_copy = (self.pair_score.weight[0] * self.pair_mask).detach().unbind()
         # The copies of a rollout are all at the same step
         at_once = not th.compiler.is_compiling() and bool((stamps[:, 0] == stamps[0, 0]).all())
         now = stamps[:1] if at_once else stamps
+        of_rows = of_age * _ages(now[:, :1], memory.stamps[:, 0]) + th.where(memory.valid, 0.0, -math.inf)
+        scores = query.detach() @ memory.states.detach().mT + of_rows
         same_copy = stamps[:, 1:2] == memory.stamps[:, 1]
         same_episode = same_copy & (stamps[:, 2:] == memory.stamps[:, 2])
-        scores = query @ memory.states.mT + of_age * _ages(now[:, :1], memory.stamps[:, 0])
-        scores += of_episode * same_episode + of_copy * same_copy
-        scores = scores.masked_fill(~memory.valid, -math.inf)
-        own = _highest(scores.masked_fill(~same_copy, -math.inf), self.n_own)
-        pool = _highest(scores.masked_fill(same_copy, -math.inf), self.n_pool)
-        return th.cat([own, pool, own.new_full((own.shape[0], 1), -1)], dim=1)
+        own_scores = (scores + of_episode * same_episode).masked_fill_(~same_copy, -math.inf)
+        own = own_scores.topk(min(self.n_own, scores.shape[1]), dim=1)
+        pool_scores = scores.masked_fill_(same_copy, -math.inf)
+        pool = topk_indices(pool_scores, min(self.n_pool, scores.shape[1]))
+        parts = (
+            _filled_up(own.indices.int(), own.values + of_copy, self.n_own),
+            _filled_up(pool, pool_scores.gather(1, pool.long()), self.n_pool),
+        )
+        rows, of_selected = (th.cat(part, dim=1) for part in zip(*parts, strict=True))
+        return F.pad(rows, (0, 1), value=-1), of_selected
 
     def _pairs(self, stamps: th.Tensor, rows: th.Tensor) -> th.Tensor:
         """Return age, same episode and same copy of stamps of rows, ``[..., N, 3]``, seen from observations, ``[B, N, 3]``."""
@@ -194,8 +205,7 @@ def _ages(now: th.Tensor, then: th.Tensor) -> th.Tensor:
     return (now - then).clamp(min=0).float().log1p() / _AGE_UNIT
 
 
-def _highest(scores: th.Tensor, n: int) -> th.Tensor:
-    """Return the columns of the n highest scores of each row, -1 in place of those of minus infinity, int32 ``[B, n]``."""
-    k = min(n, scores.shape[1])
-    top = scores.topk(k, dim=1)
-    return F.pad(th.where(top.values > -math.inf, top.indices, -1), (0, n - k), value=-1).int()
+def _filled_up(rows: th.Tensor, scores: th.Tensor, n: int) -> tuple[th.Tensor, th.Tensor]:
+    """Return rows, -1 in place of those whose score is minus infinity, and their scores, both filled up to n columns."""
+    missing = (0, n - rows.shape[1])
+    return F.pad(rows.masked_fill(scores == -math.inf, -1), missing, value=-1), F.pad(scores, missing, value=-math.inf)

@@ -183,11 +183,25 @@ def attend_beside_null(
     """
     # A sparse matrix has no more entries in a row than columns
     if not th.is_grad_enabled() or th.compiler.is_compiling() or selected.shape[1] > len(rows):
-        picked = rows[selected.long()]
-        scores = (queries[:, None] * picked).sum(dim=-1) + bias
-        weights = th.cat([scores, null[:, None]], dim=1).softmax(dim=1)
-        return (weights[:, :-1, None] * picked).sum(dim=1), weights
+        scores = (queries[:, None] * rows[selected.long()]).sum(dim=-1) + bias
+        return sum_beside_null(rows, scores, null, selected)
     return _AttendBesideNull.apply(queries, rows, bias, null, selected)
+
+
+def sum_beside_null(rows: th.Tensor, scores: th.Tensor, null: th.Tensor, selected: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Return what :func:`attend_beside_null` does where the scores are known.
+
+    :param rows: ``[T, d]``, T at least 1
+    :param scores: Scores of the selected rows, ``[B, N]``; minus infinity for a row that takes no part
+    :param null: Scores of the null row, ``[B]``
+    :param selected: The rows, int32 ``[B, N]`` in [0, T)
+    :return: The weighted sums, ``[B, d]``, and the weights, those of the null row last, ``[B, N + 1]``
+    """
+    weights = th.cat([scores, null[:, None]], dim=1).softmax(dim=1)
+    if th.compiler.is_compiling():
+        return (weights[:, :-1, None] * rows[selected.long()]).sum(dim=1), weights
+    return _sums(rows, selected, weights[:, :-1].contiguous()), weights
 
 
 class _AttendBesideNull(th.autograd.Function):
