@@ -14,7 +14,13 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.yml"))
 
 
 def test_all_are_there():
-    aisles = ["aisle_sides", "aisle_sides_each_rollout", "aisle_sides_stationary", "aisle_sides_unseen"]
+    aisles = [
+        "aisle_sides",
+        "aisle_sides_adaptive",
+        "aisle_sides_each_rollout",
+        "aisle_sides_stationary",
+        "aisle_sides_unseen",
+    ]
     assert NAMES == [
         "ablations",
         "adaptive",
