@@ -52,6 +52,7 @@ class AdaptiveBelief(nn.Module):
     :param n_own: Most rows of the same copy that are attended to, at least 0
     :param n_pool: Most rows of other copies that are attended to, at least 0
     :param row_features: Which of :data:`ROW_FEATURES` the network gets; the rest is zero
+    :param prediction_steps: Of how many steps the others' actions are predicted, the present one first, at least 1
     """
 
     variant = ADAPTIVE
@@ -68,11 +69,13 @@ class AdaptiveBelief(nn.Module):
         n_own: int = 32,
         n_pool: int = 32,
         row_features: Collection[str] = ROW_FEATURES,
+        prediction_steps: int = 1,
     ) -> None:
         super().__init__()
         self.observation_dim, self.action_dim, self.own_dim = observation_dim, action_dim, own_dim
         self.embedding_dim, self.latent_dim = embedding_dim, latent_dim
         self.n_own, self.n_pool = n_own, n_pool
+        self.prediction_steps = prediction_steps
         self.observation_embedding = nn.Sequential(
             nn.Linear(observation_dim, embedding_dim), nn.ReLU(inplace=True), nn.Linear(embedding_dim, embedding_dim)
         )
@@ -89,7 +92,7 @@ class AdaptiveBelief(nn.Module):
         self.null_key = nn.Parameter(th.zeros(embedding_dim))
         self.null_value = nn.Parameter(th.zeros(embedding_dim))
         self.encoder = nn.Sequential(nn.ReLU(), nn.Linear(embedding_dim, latent_dim))
-        self.decoder = nn.Linear(latent_dim, action_dim)
+        self.decoder = nn.Linear(latent_dim, prediction_steps * action_dim)
         own = th.tensor([["own_action" in row_features]] * (own_dim - 1) + [["reward" in row_features]])
         self.register_buffer("own_mask", own.flatten().float(), persistent=False)
         pair = th.tensor([float(name in row_features) for name in ("age", "episode", "copy")])
@@ -164,7 +167,9 @@ class AdaptiveBelief(nn.Module):
             state, weights = sum_beside_null(memory.states, scores.masked_fill(nothing, -math.inf), null, rows)
         summary = self.value(state) + self.pair_value((weights[:, :-1, None] * pairs).sum(dim=1))
         mean = self.encoder(embedding + summary + weights[:, -1:] * self.null_value)
-        return BeliefOutput(mean, mean, th.full_like(mean, -math.inf), self.decoder(mean), selected, weights)
+        predictions = self.decoder(mean).unflatten(1, (self.prediction_steps, self.action_dim))
+        later = predictions[:, 1:] if self.prediction_steps > 1 else None
+        return BeliefOutput(mean, mean, th.full_like(mean, -math.inf), predictions[:, 0], selected, weights, later)
 
     def _select(self, query: th.Tensor, stamps: th.Tensor, memory: EncodedMemory) -> tuple[th.Tensor, th.Tensor]:
         """

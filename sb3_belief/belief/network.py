@@ -36,6 +36,8 @@ class BeliefOutput(NamedTuple):
     :param selected: The history rows attended to, as indices into the rows filled so far, int32 ``[B, N_h]``;
         ``N_h`` is 0 while the history is empty, and for a belief without one
     :param weights: Their attention weights, ``[B, N_h]``, each row sums to one
+    :param later: As ``prediction``, what they do one, two, ... steps later, ``[B, k, W]``; None for a belief that predicts the
+        present step alone
     """
 
     latent: th.Tensor
@@ -44,6 +46,7 @@ class BeliefOutput(NamedTuple):
     prediction: th.Tensor | None
     selected: th.Tensor
     weights: th.Tensor
+    later: th.Tensor | None = None
 
 
 class HistoryContext(NamedTuple):

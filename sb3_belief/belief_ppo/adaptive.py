@@ -206,7 +206,7 @@ def to_be_replayed(table: Memory, flat: th.Tensor, minibatch: BeliefMinibatch) -
     :return: Arrays by name
     """
     parts = {f"table_{name}": rows for name, rows in table._asdict().items()}
-    parts |= {f"minibatch_{name}": rows for name, rows in minibatch._asdict().items()}
+    parts |= {f"minibatch_{name}": rows for name, rows in minibatch._asdict().items() if rows is not None}
     return {name: rows.cpu().numpy().copy() for name, rows in {**parts, "flat": flat}.items()}
 
 
@@ -220,7 +220,7 @@ def replayed(kept: Mapping[str, np.ndarray], device: th.device) -> Replayed:
     """
     tensors = {name: th.as_tensor(rows, device=device) for name, rows in kept.items()}
     table = Memory(*(tensors[f"table_{name}"] for name in Memory._fields))
-    minibatch = BeliefMinibatch(*(tensors[f"minibatch_{name}"] for name in BeliefMinibatch._fields))
+    minibatch = BeliefMinibatch(*(tensors.get(f"minibatch_{name}") for name in BeliefMinibatch._fields))  # type: ignore
     return Replayed(table, tensors["flat"], minibatch)
 
 

@@ -71,6 +71,7 @@ class BeliefAlgorithmMixin(_Algorithm):
     row_features: tuple[str, ...]
     history_dropout: float
     belief_replay: int
+    prediction_steps: int
     #: Whether the belief sees features unless policy_kwargs say otherwise. Models saved before it could do not
     belief_from_features: bool
     action_coef: float | Schedule
@@ -168,6 +169,7 @@ class BeliefAlgorithmMixin(_Algorithm):
             most_selected = n_selected(self.keep_ratio, self.history_length) if variant.attends else 0
         return dict(
             is_online=variant.online,
+            n_later=self.prediction_steps - 1 if variant.online else 0,
             noise_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM) if variant.samples else 0,
             max_selected=most_selected,
             others_width=layout.width,

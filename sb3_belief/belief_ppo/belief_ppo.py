@@ -63,7 +63,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param _init_setup_model: As in PPO
     :param belief: ``"dynamic"`` (the paper's method), ``"none"`` (independent PPO), or an ablation (Table 2): ``"context"``
         with the history but without the latent's distribution, ``"variational"`` with the distribution but without the
-        history, ``"static"`` with neither, ``"wide"`` with as many weights as ``"dynamic"``, but neither, and no prediction
+        history, ``"static"`` with neither, ``"wide"`` with as many weights as ``"dynamic"``, but neither, and no prediction;
+        or ``"adaptive"``, ours, which also attends to the rollout under way (issue 20)
     :param history_length: ``T_h``, how many of its own active steps the agent remembers, at least 1 (Sec. 5: 800)
     :param keep_ratio: ``p``, the share of them it attends to, in (0, 1] (Sec. 5: 0.05); at least one row is kept
     :param action_coef: ``alpha``, weight of the error of the predicted actions (eq. 8: 0.5), at least 0; may be a schedule of
@@ -83,6 +84,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param history_dropout: Of ``"adaptive"``: share of the steps in training at which it sees nothing of its memory, in [0, 1)
     :param belief_replay: Of ``"adaptive"``: on how many past rollouts its predictions are trained as well, at least 0, so that
         its weights do not learn the present teammates by heart
+    :param prediction_steps: Of ``"adaptive"``: of how many steps it predicts the others' actions, at least 1: of the present
+        one, which is what policy and value are given, and of those after it, up to the end of its return
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -140,6 +143,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
         belief_replay: int = 0,
+        prediction_steps: int = 1,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -183,6 +187,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             row_features=row_features,
             history_dropout=history_dropout,
             belief_replay=belief_replay,
+            prediction_steps=prediction_steps,
         )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief import ActionLayout
 from sb3_belief.belief_ppo.cut_returns import CutReturns
+from sb3_belief.belief_ppo.later_steps import seen_later
 
 Carrier = TypeVar("Carrier")
 
@@ -81,6 +82,8 @@ class BeliefMinibatch(NamedTuple):
     :param others_visible: Whose action was visible, bool ``[B, n_others]``
     :param stamps: When and where each step was, as of :class:`~sb3_belief.belief.memory.Memory`; None for a belief that is not
         online
+    :param later_actions: As ``others_actions``, one, two, ... steps later, ``[B, k, W]``; None where they are not predicted
+    :param later_visible: Whose action was visible then, bool ``[B, k, n_others]``; None likewise
     """
 
     noise: th.Tensor
@@ -88,6 +91,8 @@ class BeliefMinibatch(NamedTuple):
     others_actions: th.Tensor
     others_visible: th.Tensor
     stamps: th.Tensor | None = None
+    later_actions: th.Tensor | None = None
+    later_visible: th.Tensor | None = None
 
 
 def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
@@ -145,6 +150,7 @@ class BeliefBufferMixin(_Buffer):
     :param others_width: ``W``, 0 without a belief
     :param n_others: Number of others, 0 without a belief
     :param is_online: Whether the belief attends to earlier steps of the rollout, so that their stamps and rewards are kept
+    :param n_later: How many steps after a row's own are predicted, too
     """
 
     noise: np.ndarray
@@ -161,12 +167,13 @@ class BeliefBufferMixin(_Buffer):
         others_width: int = 0,
         n_others: int = 0,
         is_online: bool = False,
+        n_later: int = 0,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
         self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
-        self._is_online = is_online
-        # In each copy, the number of the step with which the present episode began
+        self._is_online, self._n_later = is_online, n_later
+        # In each copy, the step with which the present episode began
         self._began: list[int] = []
         #: What the belief is trained on besides, of the past rollouts
         self.replay: list[dict[str, np.ndarray]] = []
@@ -244,9 +251,8 @@ class BeliefBufferMixin(_Buffer):
             self.noise[self.pos] = sampled.noise.cpu().numpy()
             self.selected[self.pos, :, : self._n_selected] = sampled.selected.cpu().numpy()
         if self._is_online:
-            self.own_rewards[self.pos] = (
-                np.asarray(kwargs["reward"] if "reward" in kwargs else args[_REWARD]) - self.bootstraps
-            )
+            reward = kwargs["reward"] if "reward" in kwargs else args[_REWARD]
+            self.own_rewards[self.pos] = np.asarray(reward) - self.bootstraps
             self.bootstraps[:] = 0.0
             self.attended_actions[self.pos] = self.others_actions[self.pos]
             self.attended_visible[self.pos] = self.others_visible[self.pos]
@@ -357,9 +363,8 @@ class BeliefBufferMixin(_Buffer):
         for rows in indices:
             if leaves_out:
                 rows = np.concatenate([left_over, rows[self.active[rows]]])
-                left_over = rows[:0]
+                left_over = rows if len(rows) < 2 else rows[:0]
                 if len(rows) < 2:
-                    left_over = rows
                     continue
             yield self._samples(rows)
 
@@ -382,8 +387,8 @@ class BeliefBufferMixin(_Buffer):
         """
         selected = self.selected[rows][..., : self._n_selected]
         parts = [self.noise[rows], selected, self.others_actions[rows], self.others_visible[rows]]
-        if self._is_online:
-            parts.append(self.stamps[rows])
+        parts += [self.stamps[rows]] if self._is_online else []
+        parts += seen_later(self, rows, self._n_later) if self._n_later else ()
         return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 

@@ -101,6 +101,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param row_features: As in BeliefPPO
     :param history_dropout: As in BeliefPPO
     :param belief_replay: As in BeliefPPO
+    :param prediction_steps: As in BeliefPPO
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -156,6 +157,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
         belief_replay: int = 0,
+        prediction_steps: int = 1,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -197,6 +199,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             row_features=row_features,
             history_dropout=history_dropout,
             belief_replay=belief_replay,
+            prediction_steps=prediction_steps,
         )
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:

@@ -47,6 +47,7 @@ class BeliefNetworksMixin(_Policy):
     :param row_features: As in :class:`~sb3_belief.BeliefPPO`
     :param history_dropout: As in :class:`~sb3_belief.BeliefPPO`
     :param belief_replay: As in :class:`~sb3_belief.BeliefPPO`
+    :param prediction_steps: As in :class:`~sb3_belief.BeliefPPO`
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
@@ -77,6 +78,7 @@ class BeliefNetworksMixin(_Policy):
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
         belief_replay: int = 0,
+        prediction_steps: int = 1,
         embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
@@ -97,6 +99,7 @@ class BeliefNetworksMixin(_Policy):
             row_features=row_features,
             history_dropout=history_dropout,
             belief_replay=belief_replay,
+            prediction_steps=prediction_steps,
         )
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, Integral) or width < 1:
@@ -135,8 +138,10 @@ class BeliefNetworksMixin(_Policy):
             widths, options = (self.embedding_dim, self.latent_dim), self.options
             if options.belief == "adaptive":
                 own = RowEncoder("the agent", self.action_space).width + 1
-                n_own, n_pool, features_of_rows = options.n_own, options.n_pool, options.row_features
-                adaptive = AdaptiveBelief(sees, self.layout.width, own, *widths, n_own, n_pool, features_of_rows)
+                scopes, features_of_rows = (options.n_own, options.n_pool), options.row_features
+                adaptive = AdaptiveBelief(
+                    sees, self.layout.width, own, *widths, *scopes, features_of_rows, options.prediction_steps
+                )
             else:
                 keep_ratio, variant, similarity = options.keep_ratio, options.belief, options.similarity
                 belief = DynamicBelief(sees, self.layout.width, *widths, keep_ratio, variant, similarity)

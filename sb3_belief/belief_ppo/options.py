@@ -36,6 +36,7 @@ class BeliefOptions:
     row_features: Sequence[str] = ROW_FEATURES
     history_dropout: float = 0.0
     belief_replay: int = 0
+    prediction_steps: int = 1
 
     def __post_init__(self) -> None:
         _check_choice("belief", self.belief, BELIEFS)
@@ -63,6 +64,7 @@ class BeliefOptions:
         """Check what belongs to a belief that is online."""
         for name, given in (("n_own", self.n_own), ("n_pool", self.n_pool)):
             check_integer(name, given, 0, "the most rows of the memory that are attended to")
+        check_integer("prediction_steps", self.prediction_steps, 1, "of how many steps the others' actions are predicted")
         check_integer("belief_replay", self.belief_replay, 0, "how many past rollouts the belief is trained on, too")
         if self.belief == "adaptive" and self.n_own + self.n_pool == 0:
             raise ValueError("n_own and n_pool are 0, so nothing would be attended to; for such a belief use belief='static'.")

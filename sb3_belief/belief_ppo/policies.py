@@ -221,7 +221,7 @@ class BeliefPolicyMixin(RememberingMixin):
         """
         if belief.prediction is None:
             return None
-        loss = self.action_coef * self.action_error(belief.prediction, minibatch)
+        loss = self.action_coef * self.predictions_error(belief, minibatch)
         if self._extractor.belief.variant.samples:
             loss = loss + self.kl_coef * kl_divergence(belief.mean, belief.log_std)
         return loss
@@ -230,8 +230,27 @@ class BeliefPolicyMixin(RememberingMixin):
         """Return the belief's loss on steps of a past rollout, with the history as it was then."""
         past = extractor.replay[np.random.randint(len(extractor.replay))]
         output = extractor.judged(past.flat, past.minibatch, past.table)
-        assert output.prediction is not None
-        return self.action_coef * self.action_error(output.prediction, past.minibatch)
+        return self.action_coef * self.predictions_error(output, past.minibatch)
+
+    def predictions_error(self, belief: BeliefOutput, minibatch: BeliefMinibatch) -> th.Tensor:
+        """
+        Return the mean error of what was predicted of the present step and of those after it.
+
+        :param belief: A belief that predicts
+        :param minibatch: What the others did then
+        :return: A scalar; :meth:`action_error` for a belief that predicts the present step alone
+        """
+        assert belief.prediction is not None
+        error = self.action_error(belief.prediction, minibatch)
+        if belief.later is None or minibatch.later_actions is None or minibatch.later_visible is None:
+            return error
+        errors = [error]
+        for later in range(belief.later.shape[1]):
+            then = minibatch._replace(
+                others_actions=minibatch.later_actions[:, later], others_visible=minibatch.later_visible[:, later]
+            )
+            errors.append(self.action_error(belief.later[:, later], then))
+        return th.stack(errors).mean()
 
     def action_error(self, prediction: th.Tensor, minibatch: BeliefMinibatch) -> th.Tensor:
         """

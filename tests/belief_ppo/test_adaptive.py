@@ -99,6 +99,7 @@ SWITCHES: list[dict[str, Any]] = [
     dict(n_own=200, n_pool=200),
     dict(history_dropout=0.5),
     dict(belief_replay=2),
+    dict(prediction_steps=3, belief_replay=2),
     dict(row_features=["reward", "episode"]),
     dict(action_loss="cross_entropy"),
     dict(detach_belief=True),
@@ -118,6 +119,72 @@ def test_dropped_steps_see_the_null_row_only():
     nothing = (kept.rollouts[1]["selected"] < 0).all(axis=-1)
     # Four standard errors of 600 draws
     assert abs(nothing.mean() - 0.25) < 0.07
+
+
+class Later(BaseCallback):
+    """Callback that keeps a rollout's rows, and what each is trained to predict of later steps, before and in the update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[dict[str, Any]] = []
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        buffer = model.rollout_buffer
+        whole: dict[str, Any] = {
+            name: getattr(buffer, name).copy() for name in ("others_actions", "others_visible", "episode_starts")
+        }
+        whole["before"] = buffer.belief_minibatch(buffer.rows_of(np.arange(ROLLOUT)))
+        next(buffer.get(4))
+        whole["after"] = buffer.belief_minibatch(buffer.rows_of(np.arange(ROLLOUT)))
+        self.seen.append(whole)
+
+
+@pytest.mark.parametrize("inactive", [0, 3])
+def test_later_steps_are_those_of_the_same_episode(inactive):
+    later = Later()
+    adaptive(prediction_steps=3, env_kwargs=dict(inactive=inactive)).learn(2 * ROLLOUT, callback=later)
+    for whole in later.seen:
+        n_seen = 0
+        for number in range(ROLLOUT):
+            t, copy = divmod(number, N_ENVS)
+            for ahead in (1, 2):
+                goes_on = t + ahead < N_STEPS and not whole["episode_starts"][t + 1 : t + ahead + 1, copy].any()
+                visible = whole["others_visible"][t + ahead, copy] if goes_on else np.zeros(2, dtype=bool)
+                for part in (whole["before"], whole["after"]):
+                    assert np.array_equal(part.later_visible[number, ahead - 1], visible)
+                    if goes_on:
+                        actions = whole["others_actions"][t + ahead, copy]
+                        assert np.array_equal(part.later_actions[number, ahead - 1], actions)
+                n_seen += int(visible.sum())
+        assert n_seen > ROLLOUT / 2
+
+
+def test_later_steps_have_a_part_of_the_loss():
+    model = adaptive(prediction_steps=3, action_loss="cross_entropy", env_kwargs=dict(visible=1.0)).learn(ROLLOUT)
+    policy, buffer = model.policy, model.rollout_buffer
+    table = policy.history
+    some = buffer.belief_minibatch(np.arange(ROLLOUT))
+    flat = policy.flat_observations(th.as_tensor(buffer.observations))
+    output = policy.features_extractor.judged(flat, some._replace(selected=th.full_like(some.selected, -1)), table)
+    width = policy.layout.width
+    logits = policy.belief.decoder(output.mean)
+    errors = []
+    for step in range(3):
+        actions = some.others_actions if step == 0 else some.later_actions[:, step - 1]
+        visible = some.others_visible if step == 0 else some.later_visible[:, step - 1]
+        error = th.zeros(())
+        for other, (_, first, n) in enumerate(policy.layout.blocks):
+            columns = logits[:, step * width + first : step * width + first + n]
+            likelihood = (columns.log_softmax(dim=1) * actions[:, first : first + n]).sum(dim=1)
+            error = error - likelihood[visible[:, other]].sum()
+        errors.append(error / visible.sum())
+    th.testing.assert_close(policy.predictions_error(output, some), sum(errors) / 3)
+    # Policy and value are given the present step's alone
+    assert policy.features_extractor.belief_width == policy.belief.latent_dim + width
 
 
 def test_memories_differ_by_copy():
@@ -184,6 +251,7 @@ def test_what_cannot_be_remembered_is_refused(kwargs, message):
         (dict(n_pool=1.5), "n_pool=1.5 must be an integer"),
         (dict(n_own=0, n_pool=0), "nothing would be attended to"),
         (dict(belief_replay=-1), "belief_replay=-1 must be an integer >= 0"),
+        (dict(prediction_steps=0), "prediction_steps=0 must be an integer >= 1"),
         (dict(history_dropout=1.0), r"history_dropout is 1.0; it must be in \[0, 1\)"),
         (dict(row_features=["rewards"]), "row_features: an entry is 'rewards'; it must be one of 'own_action', 'reward'"),
         (dict(row_features="reward"), "row_features is 'reward'"),

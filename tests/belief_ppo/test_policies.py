@@ -100,6 +100,7 @@ GIVEN: dict[str, Any] = dict(
     n_pool=7,
     row_features=("reward", "age"),
     history_dropout=0.25,
+    prediction_steps=2,
     belief_replay=3,
     embedding_dim=12,
     latent_dim=6,

@@ -19,6 +19,7 @@ ADAPTIVE: dict[str, Any] = {
     "n_own": 4,
     "n_pool": 4,
     "history_dropout": 0.2,
+    "prediction_steps": 2,
     "belief_replay": 2,
     "policy_kwargs": {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4},
 }
