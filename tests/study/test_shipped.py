@@ -24,6 +24,7 @@ def test_all_are_there():
     assert NAMES == [
         "ablations",
         "adaptive",
+        "adaptive_ablations",
         *aisles,
         "changing_teammates_gate",
         "convention",
