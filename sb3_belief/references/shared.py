@@ -71,7 +71,7 @@ class SharedWeightsMixin(_Algorithm):
         """
         return super().learn(total_timesteps * self.n_agents, *args, **kwargs)
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,

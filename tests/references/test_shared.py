@@ -67,7 +67,7 @@ def test_a_row_is_what_the_agents_own_environment_would_have_been(agent_id):
         for copy in range(3):
             for i, (own_obs, own_rewards, own_dones, own_infos) in enumerate(steps):
                 row = copy * n + i
-                check(obs[row], i, own_obs[copy])
+                check(obs[row], i, own_obs[copy])  # type: ignore[index]
                 assert (rewards[row], dones[row]) == (own_rewards[copy], own_dones[copy])
                 mine, theirs = infos[row], own_infos[copy]
                 assert mine["active"] == theirs["active"]
