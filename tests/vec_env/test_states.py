@@ -1,5 +1,7 @@
 """The global state for joint learners, and the masks after an episode's last step."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -248,7 +250,7 @@ def test_no_agent_of_a_team_sees_the_state(algorithm):
             env.reset()
             env.states()
         team = Team(algorithm, policy, env, seed=0, **kwargs)
-        seen = []
+        seen: list[Any] = []
 
         def keep(locals_, globals_, seen=seen):
             seen.extend(info.keys() for info in locals_["infos"])
@@ -268,7 +270,7 @@ def test_an_agent_gets_its_own_last_mask():
             return {agent: {"action_mask": np.arange(3) <= self.t % 3 + (agent == "agent_0")} for agent in self.agents}
 
     team = Team(MaskableBeliefPPO, "BeliefPolicy", make_team_env(Ends), seed=0, n_steps=14, batch_size=14)
-    last = {agent: [] for agent in team.agents}
+    last: dict[str, list[Any]] = {agent: [] for agent in team.agents}
 
     def keeper(agent):
         def keep(locals_, globals_):
