@@ -28,6 +28,7 @@ from sb3_belief.belief_ppo.memory import holds_images, warn_of_memory
 from sb3_belief.belief_ppo.on_policy_details import DetailsAlgorithmMixin
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
+from sb3_belief.belief_ppo.others_baseline import take_off
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from sb3_belief.common.safe_files.models import add_plain_data, load_model_zip, read_model, write_model
 from sb3_belief.common.safe_files.trust import Trust
@@ -51,7 +52,7 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
     buffer_classes: ClassVar[tuple[type[BeliefBufferMixin], type[BeliefBufferMixin]]]
 
     policy: BeliefPolicyMixin
-    rollout_buffer: BeliefBufferMixin
+    rollout_buffer: Any  # A BeliefBufferMixin with a DetailsBufferMixin
     others_action_spaces: ActionSpaces
     belief: str
     history_length: int
@@ -66,6 +67,7 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
     history_dropout: float
     belief_replay: int
     prediction_steps: int
+    critic_sees_others: bool
     #: Whether the belief sees features unless policy_kwargs say otherwise. Models saved before it could do not
     belief_from_features: bool
     action_coef: float | Schedule
@@ -170,6 +172,7 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
         return dict(
             is_online=variant.online,
             n_later=self.prediction_steps - 1 if variant.online else 0,
+            shows_at_once=self.critic_sees_others,
             noise_dim=self.policy_kwargs.get("latent_dim", LATENT_DIM) if variant.samples else 0,
             max_selected=most_selected,
             others_width=layout.width,
@@ -279,7 +282,11 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
         for name, value in measure_belief(policy, buffer).items():
             self.logger.record(f"belief/{name}", value)
         policy.action_coef, policy.kl_coef = self._coefficient("action_coef"), self._coefficient("kl_coef")
+        if policy.others_baseline is not None:
+            self.logger.record("belief/advantage_variance", take_off(policy.others_baseline, policy, buffer))
+            policy.baseline_coef, self.rollout_buffer.shows_targets = self.vf_coef, True
         super().train()
+        self.rollout_buffer.shows_targets = False
         if isinstance(extractor, AdaptiveExtractor):
             if self.belief_replay:
                 # Drawn as SB3 draws minibatches

@@ -87,6 +87,9 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         its weights do not learn the present teammates by heart
     :param prediction_steps: Of ``"adaptive"``: of how many steps it predicts the others' actions, at least 1: of the present
         one, which is what policy and value are given, and of those after it, up to the end of its return
+    :param critic_sees_others: Of ``"adaptive"``: whether advantages are measured against a baseline that also sees what the
+        others did in the same step (:class:`~sb3_belief.belief_ppo.others_baseline.OthersBaseline`), with ``vf_coef`` as the
+        weight of its loss. Not where whom the agent sees after a step depends on its own action in it: that would be a bias
     :param value_norm: Whether the value is predicted in units of the returns' running mean and deviation, as in MAPPO
         (:class:`~sb3_belief.belief_ppo.value_loss.NormalizedValue`)
     :param huber_delta: Where the loss of the values turns from quadratic to linear (MAPPO: 10), above 0, in deviations with
@@ -152,6 +155,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         history_dropout: float = 0.0,
         belief_replay: int = 0,
         prediction_steps: int = 1,
+        critic_sees_others: bool = False,
         value_norm: bool = False,
         huber_delta: float | None = None,
         value_clip: float | None = None,
@@ -200,6 +204,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             history_dropout=history_dropout,
             belief_replay=belief_replay,
             prediction_steps=prediction_steps,
+            critic_sees_others=critic_sees_others,
         )
         self._setup_details(ValueOptions(value_norm, huber_delta, value_clip), active_masks)
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)

@@ -85,6 +85,8 @@ class BeliefMinibatch(NamedTuple):
         online
     :param later_actions: As ``others_actions``, one, two, ... steps later, ``[B, k, W]``; None where they are not predicted
     :param later_visible: Whose action was visible then, bool ``[B, k, n_others]``; None likewise
+    :param seen_at_once: The others' actions and whose was visible, without what was seen of them while the agent waited for
+        its next turn, float ``[B, W + n_others]``; None where no baseline sees it
     """
 
     noise: th.Tensor
@@ -94,6 +96,7 @@ class BeliefMinibatch(NamedTuple):
     stamps: th.Tensor | None = None
     later_actions: th.Tensor | None = None
     later_visible: th.Tensor | None = None
+    seen_at_once: th.Tensor | None = None
 
 
 def read_others(infos: Sequence[Mapping[str, Any]], layout: ActionLayout) -> tuple[np.ndarray, np.ndarray]:
@@ -147,6 +150,7 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
     :param n_others: Number of others, 0 without a belief
     :param is_online: Whether the belief attends to earlier steps of the rollout, so that their stamps and rewards are kept
     :param n_later: How many steps after a row's own are predicted, too
+    :param shows_at_once: Whether minibatches show what was seen of the others at once; for a belief that is online
     """
 
     noise: np.ndarray
@@ -165,11 +169,12 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
         n_others: int = 0,
         is_online: bool = False,
         n_later: int = 0,
+        shows_at_once: bool = False,
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which calls reset()
         self._widths = dict(noise=noise_dim, selected=max_selected, others_actions=others_width, others_visible=n_others)
-        self._is_online, self._n_later = is_online, n_later
+        self._is_online, self._n_later, self._shows_at_once = is_online, n_later, shows_at_once
         # In each copy, the step with which the present episode began
         self._began: list[int] = []
         #: What the belief is trained on besides, of the past rollouts
@@ -289,11 +294,16 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
         :param rows: Index into the rows as they are ordered at present
         :return: Their data, on the buffer's device; for a slice it is a part of the buffer itself
         """
-        selected = self.selected[rows][..., : self._n_selected]
-        parts = [self.noise[rows], selected, self.others_actions[rows], self.others_visible[rows]]
-        parts += [self.stamps[rows]] if self._is_online else []
-        parts += seen_later(self, rows, self._n_later) if self._n_later else ()
-        return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
+        parts = {name: getattr(self, name)[rows] for name in ("noise", "selected", "others_actions", "others_visible")}
+        parts["selected"] = parts["selected"][..., : self._n_selected]
+        if self._is_online:
+            parts["stamps"] = self.stamps[rows]
+        if self._n_later:
+            parts["later_actions"], parts["later_visible"] = seen_later(self, rows, self._n_later)
+        if self._shows_at_once:
+            seen = self.attended_actions[rows], self.attended_visible[rows]
+            parts["seen_at_once"] = np.concatenate(seen, axis=-1, dtype=np.float32)
+        return BeliefMinibatch(**{name: self.to_torch(part, copy=False) for name, part in parts.items()})
 
 
 class DetailsBufferMixin(ActiveStepsBufferMixin):

@@ -84,8 +84,8 @@ class BeliefPass:
     """
     How the belief of one forward pass is drawn, and what came of it.
 
-    A method of the policy makes it and passes it on with the observations; the extractor fills in ``noise`` and ``output``;
-    the same method reads them when the pass is over, and drops it.
+    A method of the policy makes it and passes it on with the observations; the extractor fills in ``noise``, ``output`` and
+    ``features``; the same method reads them when the pass is over, and drops it.
 
     :param noise: The noise of eq. 5, ``[B, z]``; None for the mean of the belief
     :param selected: The history rows to attend to, ``[B, N_h]``; None for the most similar ones
@@ -93,6 +93,7 @@ class BeliefPass:
     :param acts: Whether it is a pass of the agent's own rollout, which a belief that is online attends to
     :param stamps: When and where the observations were made, for a belief that is online, int64 ``[B, 3]``
     :param output: The belief
+    :param features: What policy and value are computed from
     """
 
     noise: th.Tensor | None = None
@@ -101,6 +102,7 @@ class BeliefPass:
     acts: bool = False
     stamps: th.Tensor | None = None
     output: BeliefOutput | None = None
+    features: Any = None
 
 
 class BeliefFeatures(NamedTuple):
@@ -204,7 +206,8 @@ class BeliefExtractor(BaseFeaturesExtractor):
         own = self.features(observations)
         flat = own if self.from_features else flatten_observation(observations)
         belief_pass.output = self.believe(flat, belief_pass)
-        return self.with_belief(own, belief_pass.output)
+        belief_pass.features = self.with_belief(own, belief_pass.output)
+        return belief_pass.features
 
     def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:
         """

@@ -104,6 +104,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param history_dropout: As in BeliefPPO
     :param belief_replay: As in BeliefPPO
     :param prediction_steps: As in BeliefPPO
+    :param critic_sees_others: As in BeliefPPO
     :param value_norm: As in BeliefPPO
     :param huber_delta: As in BeliefPPO
     :param value_clip: As in BeliefPPO
@@ -164,6 +165,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         history_dropout: float = 0.0,
         belief_replay: int = 0,
         prediction_steps: int = 1,
+        critic_sees_others: bool = False,
         value_norm: bool = False,
         huber_delta: float | None = None,
         value_clip: float | None = None,
@@ -210,6 +212,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             history_dropout=history_dropout,
             belief_replay=belief_replay,
             prediction_steps=prediction_steps,
+            critic_sees_others=critic_sees_others,
         )
         self._setup_details(ValueOptions(value_norm, huber_delta, value_clip), active_masks)
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)

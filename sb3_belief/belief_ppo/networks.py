@@ -18,6 +18,7 @@ from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFusion, fitting_extractor
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import action_layout
+from sb3_belief.belief_ppo.others_baseline import OthersBaseline
 from sb3_belief.common.action_encoding import RowEncoder
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class BeliefNetworksMixin(_Policy):
     :param history_dropout: As in :class:`~sb3_belief.BeliefPPO`
     :param belief_replay: As in :class:`~sb3_belief.BeliefPPO`
     :param prediction_steps: As in :class:`~sb3_belief.BeliefPPO`
+    :param critic_sees_others: As in :class:`~sb3_belief.BeliefPPO`
     :param embedding_dim: ``d``, width of the belief's embeddings, queries, keys and values
     :param latent_dim: ``z``, width of the belief
     :param fusion_activation_fn: Activation after policy and value have fused the belief
@@ -55,6 +57,8 @@ class BeliefNetworksMixin(_Policy):
         extractor computes, instead of the observation itself; :class:`~sb3_belief.BeliefPPO` turns it on for images
     """
 
+    #: The baseline that sees what the others did, if there is one
+    others_baseline: OthersBaseline | None
     #: The features extractor if the user names none; None for the one that fits the observation space
     default_extractor: ClassVar[type[BaseFeaturesExtractor] | None] = None
 
@@ -79,6 +83,7 @@ class BeliefNetworksMixin(_Policy):
         history_dropout: float = 0.0,
         belief_replay: int = 0,
         prediction_steps: int = 1,
+        critic_sees_others: bool = False,
         embedding_dim: int = EMBEDDING_DIM,
         latent_dim: int = LATENT_DIM,
         fusion_activation_fn: type[nn.Module] = nn.ReLU,
@@ -100,6 +105,7 @@ class BeliefNetworksMixin(_Policy):
             history_dropout=history_dropout,
             belief_replay=belief_replay,
             prediction_steps=prediction_steps,
+            critic_sees_others=critic_sees_others,
         )
         for name, width in (("embedding_dim", embedding_dim), ("latent_dim", latent_dim)):
             if not isinstance(width, Integral) or width < 1:
@@ -151,6 +157,7 @@ class BeliefNetworksMixin(_Policy):
         return BeliefExtractor(self.observation_space, features, belief, options, given)
 
     def _build_mlp_extractor(self) -> None:
+        self.others_baseline = None
         if not self.has_belief:
             super()._build_mlp_extractor()
             return
@@ -163,6 +170,11 @@ class BeliefNetworksMixin(_Policy):
             self.fusion_activation_fn,
             self.device,
         )
+        if self.options.critic_sees_others:
+            seen = self.layout.width + self.layout.n_others
+            with th.random.fork_rng(devices=[]):
+                # As above
+                self.others_baseline = OthersBaseline(self.features_extractor.features_dim, seen, self.device)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)

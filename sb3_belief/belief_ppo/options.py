@@ -37,6 +37,7 @@ class BeliefOptions:
     history_dropout: float = 0.0
     belief_replay: int = 0
     prediction_steps: int = 1
+    critic_sees_others: bool = False
 
     def __post_init__(self) -> None:
         _check_choice("belief", self.belief, BELIEFS)
@@ -66,6 +67,12 @@ class BeliefOptions:
             check_integer(name, given, 0, "the most rows of the memory that are attended to")
         check_integer("prediction_steps", self.prediction_steps, 1, "of how many steps the others' actions are predicted")
         check_integer("belief_replay", self.belief_replay, 0, "how many past rollouts the belief is trained on, too")
+        if not isinstance(self.critic_sees_others, bool):
+            raise ValueError(f"critic_sees_others is {self.critic_sees_others!r}; it must be True or False")
+        if self.critic_sees_others and self.belief != "adaptive":
+            raise ValueError(
+                f"critic_sees_others=True belongs to belief='adaptive', and belief is {self.belief!r}; leave it False there"
+            )
         if self.belief == "adaptive" and self.n_own + self.n_pool == 0:
             raise ValueError("n_own and n_pool are 0, so nothing would be attended to; for such a belief use belief='static'.")
         if isinstance(self.row_features, str):

@@ -65,6 +65,8 @@ class BeliefPolicyMixin(RememberingMixin):
     #: Weights of the two terms of the belief's loss (eq. 8), set by the algorithm before each update
     action_coef: float = 0.5
     kl_coef: float = 0.005
+    #: Weight of the loss of the baseline that sees the others, likewise
+    baseline_coef: float = 0.5
 
     def _build(self, lr_schedule: Schedule) -> None:
         if self.optimizer_class is th.optim.Adam:
@@ -182,6 +184,10 @@ class BeliefPolicyMixin(RememberingMixin):
         if isinstance(self._extractor, AdaptiveExtractor) and self._extractor.replay:
             assert loss is not None
             loss = loss + self._replayed_loss(self._extractor)
+        targets = getattr(obs, "value_targets", None)
+        if self.others_baseline is not None and targets is not None:
+            assert loss is not None
+            loss = loss + self.baseline_coef * self.others_baseline.loss(belief_pass.features, minibatch, targets)
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 
     def belief_loss(self, belief: BeliefOutput, minibatch: BeliefMinibatch) -> th.Tensor | None:

@@ -17,6 +17,7 @@ from sb3_belief.belief_ppo import (
     MaskableBeliefActorCriticPolicy,
     MaskableBeliefPPO,
 )
+from sb3_belief.belief_ppo.on_policy_details import ACTION_GAIN, DetailsPolicyMixin
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from tests.belief_ppo.helpers import ALGORITHMS, SMALL, observations_of
 from tests.belief_ppo.toy_envs import AmongOthers
@@ -60,9 +61,14 @@ def test_each_name_stands_for_the_extractor_that_sb3_has_for_it(algorithm, name,
     assert model.predict(obs)[0].shape == (4,)
 
 
+def stock_of(algorithm: Any) -> Any:
+    """The algorithm of SB3 or sb3-contrib that one of ours is made from."""
+    return next(kind for kind in algorithm.__mro__ if kind.__module__.startswith(("stable_baselines3.", "sb3_contrib.")))
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_names_are_sb3s_and_one_more(algorithm):
-    stock = algorithm.__mro__[2]
+    stock = stock_of(algorithm)
     assert stock.__name__ == algorithm.stock
     assert set(algorithm.policy_aliases) == set(stock.policy_aliases) | {"BeliefPolicy"}
     for name, policy in stock.policy_aliases.items():
@@ -101,6 +107,10 @@ GIVEN: dict[str, Any] = dict(
     row_features=("reward", "age"),
     history_dropout=0.25,
     prediction_steps=2,
+    critic_sees_others=False,
+    value_norm=True,
+    obs_layer_norm=True,
+    action_gain=ACTION_GAIN,
     belief_replay=3,
     embedding_dim=12,
     latent_dim=6,
@@ -174,17 +184,19 @@ def test_an_algorithm_takes_all_arguments_of_the_one_it_is_made_from(algorithm, 
     def arguments(cls):
         return {name: p.default for name, p in inspect.signature(cls.__init__).parameters.items() if name != "policy"}
 
-    ours, stock = arguments(algorithm), arguments(algorithm.__mro__[2])
+    ours, stock = arguments(algorithm), arguments(stock_of(algorithm))
     assert list(ours)[: len(stock)] == list(stock) and {name: ours[name] for name in stock} == stock
     added = set(ours) - set(stock)
     # What a user says about the belief has the same default wherever it can be said
     policy = {name: p.default for name, p in inspect.signature(BeliefPolicyMixin.__init__).parameters.items()}
-    assert added - {"action_coef", "kl_coef"} == set(policy) & added
-    assert all(ours[name] == policy[name] for name in set(policy) & added)
+    policy |= {name: p.default for name, p in inspect.signature(DetailsPolicyMixin.__init__).parameters.items()}
+    of_training = {"action_coef", "kl_coef", "huber_delta", "value_clip", "active_masks"}
+    assert added - of_training <= set(policy)
+    assert all(ours[name] == policy[name] for name in added - of_training)
     for name in added:
         assert f":param {name}:" in algorithm.__doc__
     of_learn = inspect.signature(algorithm.learn).parameters
-    for name, p in inspect.signature(algorithm.__mro__[2].learn).parameters.items():
+    for name, p in inspect.signature(stock_of(algorithm).learn).parameters.items():
         assert name in of_learn and (name == "tb_log_name" or of_learn[name].default == p.default)
     assert of_learn["tb_log_name"].default == algorithm.__name__
     assert algorithm.policy_base is base

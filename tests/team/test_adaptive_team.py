@@ -20,6 +20,7 @@ ADAPTIVE: dict[str, Any] = {
     "n_pool": 4,
     "history_dropout": 0.2,
     "prediction_steps": 2,
+    "critic_sees_others": True,
     "belief_replay": 2,
     "policy_kwargs": {"net_arch": [8], "embedding_dim": 8, "latent_dim": 4},
 }
