@@ -86,7 +86,7 @@ def minibatch() -> Entered:
         recorder.stop()
         yield from minibatches
 
-    model.rollout_buffer.get = watched  # type: ignore[method-assign]
+    model.rollout_buffer.get = watched
     model.learn(42, reset_num_timesteps=False)
     return recorder.entered
 

@@ -64,7 +64,7 @@ def test_a_team_with_beliefs_learns_behind_wrappers(name):
 def test_observations_are_those_of_the_wrapper():
     env = make_team_env("traffic-junction-easy", wrapper=WRAPPERS["frame_stack"])
     plain = make_team_env("traffic-junction-easy")
-    assert env.observation_space["car_0"].shape == (3 * plain.observation_space["car_0"].shape[0],)  # type: ignore[index]
+    assert env.observation_space["car_0"].shape == (3 * plain.observation_space["car_0"].shape[0],)
 
 
 def test_black_death_is_refused_with_the_reason():
