@@ -5,8 +5,8 @@ Does an agent still adapt after it has learned beside one and the same teammate 
 
 A follower first learns among conventions that change every five rollouts (convention-redraw, the entry of
 zoo_configs/belief_ppo.yml), then for 200 rollouts beside one leader who never changes. Then weights are frozen and the leader
-is swapped for each of the other 23 conventions: success with the memory as it is, and after 800 observed steps of the new one. By
-chance it is 1/4. The share recovered is that of what the swap has cost.
+is swapped for each of the other 23 conventions: success with the memory as it is, and after 800 observed steps of the new one.
+By chance it is 1/4. The share recovered is that of what the swap has cost.
 """
 
 import argparse
