@@ -19,11 +19,12 @@ PolicyState = tuple[np.ndarray, ...] | None
 
 def takes_masks(model: BaseAlgorithm) -> bool:
     """
-    Tell whether a model's ``predict`` takes action masks.
+    Tell whether a model's ``predict`` is to be given action masks.
 
-    :param model: Of an agent
+    :param model: Of an agent. One for which masks are optional has ``uses_masks``, whether its environment had any
     """
-    return _has_masks_argument(getattr(model.predict, "__func__", model.predict))
+    takes = _has_masks_argument(getattr(model.predict, "__func__", model.predict))
+    return takes and getattr(model, "uses_masks", True)
 
 
 @cache

@@ -97,6 +97,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "belief_ppo": Algo("sb3_belief.belief_ppo:BeliefPPO"),
         "ippo": Algo("sb3_belief.belief_ppo:BeliefPPO", _NO_BELIEF),
         "ippo_wide": Algo("sb3_belief.belief_ppo:BeliefPPO", MappingProxyType({"belief": "wide"})),
+        "iac": Algo("sb3_belief.baselines.iac:IAC"),
         "ippo_shared": Algo("sb3_belief.references.shared:SharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED),
         "maskable_ippo_shared": Algo(
             "sb3_belief.references.shared:MaskableSharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED
