@@ -88,6 +88,7 @@ def _import(path: str) -> Any:
 #: What is said of models that all agents have in common
 SHARED = "shares weights: not decentralised"
 _NO_BELIEF: Mapping[str, Any] = MappingProxyType({"belief": "none"})
+_AMF: Mapping[str, Any] = MappingProxyType({"belief": "static", "action_loss": "cross_entropy", "detach_belief": False})
 _SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
 
 
@@ -97,6 +98,8 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "belief_ppo": Algo("sb3_belief.belief_ppo:BeliefPPO"),
         "ippo": Algo("sb3_belief.belief_ppo:BeliefPPO", _NO_BELIEF),
         "ippo_wide": Algo("sb3_belief.belief_ppo:BeliefPPO", MappingProxyType({"belief": "wide"})),
+        "amf_ppo": Algo("sb3_belief.baselines.amf:AMFPPO", _AMF),
+        "maskable_amf_ppo": Algo("sb3_belief.baselines.amf:MaskableAMFPPO", _AMF),
         "iac": Algo("sb3_belief.baselines.iac:IAC"),
         "ippo_shared": Algo("sb3_belief.references.shared:SharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED),
         "maskable_ippo_shared": Algo(
