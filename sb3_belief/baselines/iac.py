@@ -176,7 +176,7 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
         "MultiInputPolicy": IACMultiInputPolicy,
     }
     #: Its environment need not have masks
-    needs_masks: ClassVar[bool] = False
+    needs_action_masks: ClassVar[bool] = False
 
     def __init__(self, policy: str | type[IACPolicy], env: Any, *args: Any, **kwargs: Any) -> None:
         refuse_many_agents(env, type(self).__name__)

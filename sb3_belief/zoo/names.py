@@ -89,6 +89,10 @@ def _import(path: str) -> Any:
 SHARED = "shares weights: not decentralised"
 _NO_BELIEF: Mapping[str, Any] = MappingProxyType({"belief": "none"})
 _AMF: Mapping[str, Any] = MappingProxyType({"belief": "static", "action_loss": "cross_entropy", "detach_belief": False})
+#: What is said of references that learn centrally
+CENTRAL = "uses the global state in training"
+_STATE = "sb3_belief.references.with_state:with_state"
+_SHARED_STATE = "sb3_belief.references.adapters:shared_with_state"
 _SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
 
 
@@ -105,6 +109,15 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "maskable_ippo_shared": Algo(
             "sb3_belief.references.shared:MaskableSharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED
         ),
+        **{
+            name: Algo(f"sb3_belief.references.{path}", _NO_BELIEF, adapter=adapter, note=note)
+            for name, path, adapter, note in (
+                ("mappo", "mappo:MAPPO", _STATE, CENTRAL),
+                ("maskable_mappo", "mappo:MaskableMAPPO", _STATE, CENTRAL),
+                ("mappo_shared", "shared:SharedMAPPO", _SHARED_STATE, f"{CENTRAL}, {SHARED}"),
+                ("maskable_mappo_shared", "shared:MaskableSharedMAPPO", _SHARED_STATE, f"{CENTRAL}, {SHARED}"),
+            )
+        },
         "maskable_belief_ppo": Algo("sb3_belief.belief_ppo:MaskableBeliefPPO"),
         "ppo": Algo("stable_baselines3:PPO"),
         "a2c": Algo("stable_baselines3:A2C"),
