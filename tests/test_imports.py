@@ -13,6 +13,7 @@ LAYERS = [
     {"belief_ppo", "vec_env"},
     {"envs"},
     {"team"},
+    {"baselines"},
     {"report", "export"},
     {"zoo"},
     {"study"},
