@@ -118,6 +118,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
                 ("maskable_mappo_shared", "shared:MaskableSharedMAPPO", _SHARED_STATE, f"{CENTRAL}, {SHARED}"),
             )
         },
+        "iql": Algo("sb3_belief.baselines:IQL"),
         "maskable_belief_ppo": Algo("sb3_belief.belief_ppo:MaskableBeliefPPO"),
         "ppo": Algo("stable_baselines3:PPO"),
         "a2c": Algo("stable_baselines3:A2C"),

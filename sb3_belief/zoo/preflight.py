@@ -209,7 +209,7 @@ def agent_without_masks(config: RunConfig, env: TeamVecEnv) -> str | None:
     """
     masks = env.action_masks() or {}
     for agent in env.possible_agents:
-        algo_class = config.agent(agent).algo_class
+        algo_class: Any = config.agent(agent).algo_class
         takes_masks = "action_masks" in signature(algo_class.predict).parameters
         if takes_masks and getattr(algo_class, "needs_action_masks", True) and agent not in masks:
             return agent
