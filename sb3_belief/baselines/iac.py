@@ -180,8 +180,8 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
 
     def __init__(self, policy: str | type[IACPolicy], env: Any, *args: Any, **kwargs: Any) -> None:
         refuse_many_agents(env, type(self).__name__)
-        #: Whether the environment has had masks, so that ``predict`` is to be given them
-        self.uses_masks = False
+        #: Whether the environment has had masks, so that ``predict`` misses them if it is given none
+        self.learned_with_masks = False
         super().__init__(policy, env, *args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -196,7 +196,7 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
                 " IACDictRolloutBuffer)"
             )
         super()._setup_model()
-        self.uses_masks = self.uses_masks or (self.env is not None and self._has_masks(self.env))
+        self.learned_with_masks = self.learned_with_masks or (self.env is not None and self._has_masks(self.env))
 
     def _has_masks(self, env: VecEnv) -> bool:
         return mask_width(self.action_space) > 0 and env.has_attr("action_masks")
@@ -219,7 +219,7 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
         assert isinstance(rollout_buffer, IACBufferMixin)
         rollout_buffer.has_masks = self._has_masks(env)
         if rollout_buffer.has_masks:
-            self.uses_masks = True
+            self.learned_with_masks = True
             self.policy.read_masks = partial(_masks_of, env)
         try:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)

@@ -19,12 +19,11 @@ PolicyState = tuple[np.ndarray, ...] | None
 
 def takes_masks(model: BaseAlgorithm) -> bool:
     """
-    Tell whether a model's ``predict`` is to be given action masks.
+    Tell whether a model's ``predict`` takes action masks.
 
-    :param model: Of an agent. One for which masks are optional has ``uses_masks``, whether its environment had any
+    :param model: Of an agent
     """
-    takes = _has_masks_argument(getattr(model.predict, "__func__", model.predict))
-    return takes and getattr(model, "uses_masks", True)
+    return _has_masks_argument(getattr(model.predict, "__func__", model.predict))
 
 
 def _misses_masks(model: BaseAlgorithm) -> bool:

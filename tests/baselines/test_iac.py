@@ -166,12 +166,11 @@ def test_it_runs_beside_other_algorithms_and_is_loaded(tmp_path):
     expected, _ = team.predict(obs, deterministic=True, action_masks=masks)
     found, _ = loaded.predict(obs, deterministic=True, action_masks=masks)
     assert all(np.array_equal(found[agent], expected[agent]) for agent in expected)
-    assert loaded.agents["agent_0"].uses_masks
+    assert loaded.agents["agent_0"].learned_with_masks
 
 
 def test_without_masks_it_asks_for_none(recwarn):
     team = Team(IAC, "MlpPolicy", make_team_env(ToyEnv, n_envs=2, seed=0), **SMALL).learn(28)
-    assert not team.takes_masks
     team.predict(team.get_env().reset())
     assert not [warning for warning in recwarn if "mask" in str(warning.message)]
 
