@@ -6,19 +6,22 @@ import torch as th
 
 
 class _AddLoss(th.autograd.Function):
-    """The identity on ``values``, whose backward pass also hands ``loss`` a gradient of one."""
+    """The identity on ``values``, whose backward pass scales their gradient, and hands ``loss`` a gradient of one."""
 
     @staticmethod
-    def forward(ctx: Any, values: th.Tensor, loss: th.Tensor) -> th.Tensor:
+    def forward(ctx: Any, values: th.Tensor, loss: th.Tensor, scale: float | th.Tensor) -> th.Tensor:
+        ctx.scale = scale
         return values.view_as(values)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor, None]:
         (grad_values,) = grad_outputs
-        return grad_values, grad_values.new_ones(())
+        # Times one would be the same bits, and a kernel more
+        scaled = grad_values if isinstance(ctx.scale, float) and ctx.scale == 1.0 else ctx.scale * grad_values
+        return scaled, grad_values.new_ones(()), None
 
 
-def add_loss(values: th.Tensor, loss: th.Tensor) -> th.Tensor:
+def add_loss(values: th.Tensor, loss: th.Tensor, scale: float | th.Tensor = 1.0) -> th.Tensor:
     """
     Let ``loss`` be minimised together with whatever is computed from ``values``.
 
@@ -29,6 +32,7 @@ def add_loss(values: th.Tensor, loss: th.Tensor) -> th.Tensor:
 
     :param values: Values as the policy returns them, in the graph that is differentiated
     :param loss: A scalar
+    :param scale: Weight of whatever is computed from the values, a constant: the sum is then ``scale * loss_of_SB3 + loss``
     :return: The same values
     """
-    return _AddLoss.apply(values, loss)
+    return _AddLoss.apply(values, loss, scale)

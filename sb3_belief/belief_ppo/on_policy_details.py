@@ -71,11 +71,18 @@ class DetailsPolicyMixin(_Policy):
 
     def _build_mlp_extractor(self) -> None:
         super()._build_mlp_extractor()
+        self._add_layer_norms()
+
+    def _add_layer_norms(self) -> None:
         # Those of a belief's fusion are within
         networks: Any = getattr(self.mlp_extractor, "base", self.mlp_extractor)
         if self.obs_layer_norm and isinstance(networks, MlpExtractor):
             width = getattr(self.features_extractor, "features", self.features_extractor).features_dim
-            networks.policy_net = nn.Sequential(nn.LayerNorm(width, device=self.device), *networks.policy_net)
+            # An actor may be given the first of them only
+            own_width = getattr(networks, "own_dim", width)
+            if own_width == 1:
+                raise ValueError("obs_layer_norm=True would make an observation of one number zero: leave it False")
+            networks.policy_net = nn.Sequential(nn.LayerNorm(own_width, device=self.device), *networks.policy_net)
             networks.value_net = nn.Sequential(nn.LayerNorm(width, device=self.device), *networks.value_net)
 
     def _build(self, lr_schedule: Schedule) -> None:
