@@ -45,7 +45,7 @@ def test_a_worker_ends_with_its_parent(way, method, tmp_path):
         assert len(marked(marker)) >= 4
         process.kill()
         process.wait(timeout=10)
-        assert gone_within(5.0, marker) == []
+        assert gone_within(30.0, marker) == []
     finally:
         for pid, _ in marked(marker):
             os.kill(pid, signal.SIGKILL)
@@ -177,4 +177,4 @@ def test_a_process_of_multiprocessing_ends_with_workers_that_it_still_holds(meth
     process = run_script(script, tmp_path, marker)
     assert process.communicate(timeout=120)[0] == "0\n"
     assert process.returncode == 0
-    assert not gone_within(10, marker)
+    assert not gone_within(30, marker)

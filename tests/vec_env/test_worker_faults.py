@@ -387,7 +387,7 @@ def test_no_process_stays(case, name, tmp_path):
         started = time.monotonic()
         process.wait(timeout=10)
         assert time.monotonic() - started < 5
-        assert gone_within(5.0, marker) == []
+        assert gone_within(30.0, marker) == []
     finally:
         for pid, _ in marked(marker):
             os.kill(pid, signal.SIGKILL)

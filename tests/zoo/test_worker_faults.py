@@ -66,7 +66,7 @@ def test_one_signal_ends_a_run_that_hangs(name, status, tmp_path):
     process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, preexec_fn=lambda: _default(signal.SIGINT))
     assert process.stdout is not None
     try:
-        deadline = time.monotonic() + 40
+        deadline = time.monotonic() + 120
         # The main process, two copies, one worker of the agents, and those of multiprocessing
         while not (only_there(tmp_path) and len(marked(marker)) >= 6) and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -76,8 +76,8 @@ def test_one_signal_ends_a_run_that_hangs(name, status, tmp_path):
         assert f"Interrupted by {name}" in process.stdout.readline().decode()
         # What follows is the end of Python itself, which takes its time where others compute
         assert time.monotonic() - started < 5
-        assert process.wait(timeout=10) == status
-        assert gone_within(3.0, marker) == []
+        assert process.wait(timeout=30) == status
+        assert gone_within(30.0, marker) == []
     finally:
         for pid, _ in marked(marker):
             os.kill(pid, signal.SIGKILL)

@@ -184,7 +184,7 @@ def test_no_process_stays_after_kill_9(case, tmp_path):
     assert process.stdout is not None
     try:
         assert process.stdout.readline() == "ready\n"
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 120
         # This process, two copies, one worker, and those of multiprocessing
         while len(marked(marker)) < 6 and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -192,7 +192,7 @@ def test_no_process_stays_after_kill_9(case, tmp_path):
         assert len(marked(marker)) >= 6
         process.kill()
         process.wait(timeout=10)
-        assert gone_within(5.0, marker) == []
+        assert gone_within(30.0, marker) == []
     finally:
         for pid, _ in marked(marker):
             with suppress(OSError):
