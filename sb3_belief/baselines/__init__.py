@@ -4,6 +4,7 @@ Decentralised methods to compare with: one SB3 model for each agent, which sees 
 Nothing here imports ``sb3_belief.references``, whose methods use the global state in training.
 """
 
+from sb3_belief.baselines.dpiqn import DPIQN, DRPIQN
 from sb3_belief.baselines.iql import IQL
 
-__all__ = ["IQL"]
+__all__ = ["DPIQN", "DRPIQN", "IQL"]
