@@ -5,7 +5,8 @@ Nothing here imports ``sb3_belief.references``, whose methods use the global sta
 """
 
 from sb3_belief.baselines.amf import AMFPPO, MaskableAMFPPO
+from sb3_belief.baselines.dpiqn import DPIQN, DRPIQN
 from sb3_belief.baselines.iac import IAC
 from sb3_belief.baselines.iql import IQL
 
-__all__ = ["AMFPPO", "IAC", "IQL", "MaskableAMFPPO"]
+__all__ = ["AMFPPO", "DPIQN", "DRPIQN", "IAC", "IQL", "MaskableAMFPPO"]

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.dqn.dqn import DQN
 
-from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer
+from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
 from sb3_belief.baselines.q_networks import MaskedQCnnPolicy, MaskedQMultiInputPolicy, MaskedQPolicy
 
 SelfIQL = TypeVar("SelfIQL", bound="IQL")
@@ -134,7 +134,8 @@ class IQL(DQN):
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = MaskedDictReplayBuffer if is_dict else MaskedReplayBuffer
         super()._setup_model()
-        self.q_net_target.double_q = self.double_q
+        target: Any = self.q_net_target
+        target.double_q = self.double_q
 
     # Acting
 
@@ -220,7 +221,7 @@ class IQL(DQN):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        assert isinstance(replay_buffer, MaskedReplayBuffer | MaskedDictReplayBuffer)
+        assert isinstance(replay_buffer, MaskedReplayMixin)
         replay_buffer.stage(self._next_masks(dones, infos), self._learnable(dones, infos))
         # A limit cuts off the return of a dead agent, too, whose values are learned here
         infos = [{**info, "TimeLimit.truncated": True} if info.get("truncated", False) else info for info in infos]

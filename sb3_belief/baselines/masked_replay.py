@@ -34,9 +34,10 @@ class MaskedReplayMixin(_Buffer):
         super().__init__(*args, **kwargs)
         rows = self.buffer_size, self.n_envs
         #: Which actions are possible at the next observation, bool ``[buffer_size, n_envs, n_actions]``
-        self.next_masks = np.ones((*rows, int(self.action_space.n)), dtype=bool)  # type: ignore[attr-defined]
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        self.next_masks: np.ndarray = np.ones((*rows, n_actions), dtype=bool)
         #: From which rows there is something to learn, bool ``[buffer_size, n_envs]``
-        self.learnable = np.ones(rows, dtype=bool)
+        self.learnable: np.ndarray = np.ones(rows, dtype=bool)
 
     def stage(self, next_masks: np.ndarray | None, learnable: np.ndarray) -> None:
         """

@@ -26,6 +26,7 @@ def make_team_env(
     restart_workers: int = 0,
     observe_last: bool | Sequence[str] = False,
     partner_starts: bool | Sequence[str] = False,
+    observe_window: int | Mapping[str, int] = 0,
 ) -> TeamVecEnv:
     """
     Make ``n_envs`` copies of a team environment as one SB3 ``VecEnv``.
@@ -53,6 +54,8 @@ def make_team_env(
         action and reward, see ``ObserveLastVecEnv``. True for all agents, or the names of those that do
     :param partner_starts: Whether agents are told where another partner has come, and observe their last step also over the
         ends of episodes, for ``PartnerRecurrentPPO``. True for all agents, or the names of those that are
+    :param observe_window: How many of its last observations an agent observes, ``[L, d]``, see ``ObserveWindowVecEnv``: a
+        number for all agents, or by agent for those that do. 0 for the observations as they are
     :return: The vectorised environment
     :raises TypeError: If ``env`` is an environment instead of a callable that makes one
     :raises ValueError: For an unknown id, an unknown ``vec_env``, ``n_envs < 1``, a ``step_timeout`` that is not positive or
@@ -85,7 +88,7 @@ def make_team_env(
     if team_env is None:
         make_copies = [partial(_make_joint, make_one, wrapper, visibility, copy) for copy in range(n_envs)]
         team_env = ParallelTeamVecEnv(make_copies, vec_env == "subproc", step_timeout, restart_workers)
-    team_env = with_last_step(team_env, observe_last, partner_starts)
+    team_env = with_last_step(team_env, observe_last, partner_starts, observe_window)
     if seed is not None:
         team_env.seed(seed)
     return team_env

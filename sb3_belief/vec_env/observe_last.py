@@ -14,6 +14,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_belief.common.action_encoding import RowEncoder
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts, row_of
+from sb3_belief.vec_env.observe_window import ObserveWindowVecEnv
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 from sb3_belief.vec_env.team_wrapper import TeamVecEnvWrapper
 from sb3_belief.vec_env.validation import difference
@@ -209,20 +210,24 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
 
 
 def with_last_step(
-    env: TeamVecEnv, observe_last: bool | Sequence[str] = False, partner_starts: bool | Sequence[str] = False
+    env: TeamVecEnv,
+    observe_last: bool | Sequence[str] = False,
+    partner_starts: bool | Sequence[str] = False,
+    observe_window: int | Mapping[str, int] = 0,
 ) -> TeamVecEnv:
     """
-    Let agents observe besides what an :class:`ObserveLastVecEnv` adds.
+    Let agents observe besides what an :class:`ObserveLastVecEnv` adds, and their last observations.
 
     :param env: Environment of a team, which is closed if it cannot be
     :param observe_last: As for ``ObserveLastVecEnv``
     :param partner_starts: As for ``ObserveLastVecEnv``
+    :param observe_window: As for ``ObserveWindowVecEnv``; 0 for the observations as they are
     :return: The environment, as it is if nothing is asked for
     """
-    if observe_last is False and partner_starts is False:
-        return env
     try:
-        return ObserveLastVecEnv(env, observe_last, partner_starts)
+        if not (observe_last is False and partner_starts is False):
+            env = ObserveLastVecEnv(env, observe_last, partner_starts)
+        return ObserveWindowVecEnv(env, observe_window) if observe_window else env
     except BaseException:
         env.close()
         raise

@@ -119,6 +119,8 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
             )
         },
         "iql": Algo("sb3_belief.baselines:IQL"),
+        "dpiqn": Algo("sb3_belief.baselines:DPIQN"),
+        "drpiqn": Algo("sb3_belief.baselines:DRPIQN"),
         "maskable_belief_ppo": Algo("sb3_belief.belief_ppo:MaskableBeliefPPO"),
         "ppo": Algo("stable_baselines3:PPO"),
         "a2c": Algo("stable_baselines3:A2C"),

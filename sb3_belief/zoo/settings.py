@@ -28,6 +28,7 @@ RUN_KEYS: dict[str, Any] = {
     "env_wrapper": str | list[Any] | dict[str, Any] | None,
     "visibility": str | dict[str, Any] | None,
     "observe_last": bool | list[str],
+    "observe_window": int | dict[str, int],
     "memory_span": str,
     "env_kwargs": dict[str, Any],
     "eval_env_kwargs": dict[str, Any],
@@ -197,7 +198,9 @@ def observation_arguments(settings: Mapping[str, Any]) -> dict[str, Any]:
     observe_last = settings.get("observe_last", False)
     # Names in observe_last are those of the agents that learn: their memories are meant, too
     told = (observe_last or True) if settings.get("memory_span") == "partner" else False
-    return {name: value for name, value in (("observe_last", observe_last), ("partner_starts", told)) if value}
+    window = settings.get("observe_window", 0)
+    given = ("observe_last", observe_last), ("partner_starts", told), ("observe_window", window)
+    return {name: value for name, value in given if value}
 
 
 def _check_callback(callback: Any, location: Location) -> None:

@@ -246,7 +246,7 @@ def test_where_an_environment_does_not_say_its_last_masks_all_actions_count():
         def action_masks(self):
             return np.arange(3) == self.t % 3
 
-    model = IQL("MlpPolicy", Alone(), seed=0, **Q_KWARGS).learn(60)
+    model: Any = IQL("MlpPolicy", Alone(), seed=0, **Q_KWARGS).learn(60)
     masks = model.replay_buffer.next_masks[:8, 0].sum(axis=1)
     assert masks.tolist() == [1, 1, 1, 3, 1, 1, 1, 3]
 

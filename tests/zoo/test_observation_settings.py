@@ -42,6 +42,34 @@ def test_a_run_trains_evaluates_resumes_and_is_shown(tmp_path, capsys):
     assert "Episode 3: return" in capsys.readouterr().out
 
 
+def test_a_run_with_windows_trains_evaluates_resumes_and_is_shown(tmp_path, capsys):
+    small = (
+        "n_envs:2",
+        "buffer_size:200",
+        "batch_size:8",
+        "learning_starts:16",
+        "observe_window:3",
+        "policy_kwargs.net_arch:[8]",
+    )
+
+    def given(folder, total):
+        return [
+            *("--algo", "drpiqn", "--env", "convention-swap", "--seed", "1", "-n", str(total), "--verbose", "0"),
+            *("-f", str(tmp_path / folder), "--eval-freq", "32", "--eval-episodes", "2", "--n-eval-envs", "2"),
+            *("--save-freq", "32", "-params", *small),
+        ]
+
+    for folder, total in (("whole", 96), ("parts", 64)):
+        assert train_main(given(folder, total)) == 0
+    whole, parts = (tmp_path / folder / "drpiqn" / "convention-swap_1" for folder in ("whole", "parts"))
+    assert train_main(["--resume", str(parts), "--until", "96", "--verbose", "0"]) == 0
+    check_same_run(parts, whole)
+    assert Team.load(whole / "team.zip").agents["follower"].observation_space.shape == (3, 4)
+    capsys.readouterr()
+    assert main(["enjoy", str(whole), "--episodes", "2"]) == 0
+    assert "Episode 2: return" in capsys.readouterr().out
+
+
 def test_enjoy_observes_where_someone_can(tmp_path, capsys):
     for algo in ("belief_ppo", "ippo"):
         assert train_main(words(tmp_path, algo, "convention-swap", 32, "policy_kwargs.net_arch:[8]")) == 0

@@ -14,7 +14,7 @@ from sb3_belief.team.lockstep.joint_loop import JointLoop
 from tests.envs.aisle_sides.variants import VARIANTS
 
 # What an agent's own info may hold
-TOLD = {"others_actions", "others_visible", "active", "terminal_observation", "episode", "TimeLimit.truncated"}
+TOLD = {"others_actions", "others_visible", "active", "terminal_observation", "episode", "TimeLimit.truncated", "truncated"}
 
 
 def random_actions(env, rng):

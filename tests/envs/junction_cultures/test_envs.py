@@ -20,7 +20,7 @@ VARIANTS: list[dict[str, Any]] = [
 # What an agent's own info may hold
 TOLD = {
     *("others_actions", "others_visible", "active", "terminal_observation", "episode", "TimeLimit.truncated"),
-    *("is_success", "action_mask", "terminal_action_masks"),
+    *("is_success", "action_mask", "terminal_action_masks", "truncated"),
 }
 
 

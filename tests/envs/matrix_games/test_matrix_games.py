@@ -72,7 +72,7 @@ def test_a_table_is_played_n_times_an_episode():
     env = make_team_env("climbing", env_kwargs={"n_steps": 25})
     env.reset()
     for t in range(25):
-        _, rewards, dones, infos = env.step({agent: np.array([1]) for agent in ("agent_0", "agent_1")})
+        _, rewards, dones, infos = env.step({"agent_0": np.ones(1, int), "agent_1": np.ones(1, int)})
         assert dones[0] == (t == 24)
     assert rewards[0] == 7 and infos[0]["episode"]["r"] == 175 and not infos[0]["TimeLimit.truncated"]
 
