@@ -4,6 +4,7 @@ could see. :class:`AgentVecEnv` is the vectorised environment that the agent's m
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
@@ -120,8 +121,9 @@ class AgentVecEnv(VecEnv):
         self.agent = agent
         self._source = source
         self._actions = np.zeros(0)
-        self._others_action_spaces = {other: space for other, space in source.action_spaces.items() if other != agent}
-        self._others_action_spaces.update(source.scripted_action_spaces)
+        others = {other: space for other, space in source.action_spaces.items() if other != agent}
+        # Copies: a space has a random generator, which is its owner's
+        self._others_action_spaces = deepcopy({**others, **source.scripted_action_spaces})
         super().__init__(source.num_envs, source.observation_spaces[agent], source.action_spaces[agent])
 
     def reset(self) -> np.ndarray:
