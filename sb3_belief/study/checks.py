@@ -73,7 +73,8 @@ class CheckedStudy:
                     if evaluation.online:
                         played = f"whose own episodes count, the last {evaluation.final_episodes} at the end"
                     runs = f"{_count(seeds, 'run')} of {config.n_timesteps:,} joint steps"
-                    lines.append(f"  {arm:<{width}}  {config.algo}: {runs}, {played}")
+                    note = f" ({config.note})" if config.note else ""
+                    lines.append(f"  {arm:<{width}}  {config.algo}{note}: {runs}, {played}")
         return "\n".join(lines)
 
 

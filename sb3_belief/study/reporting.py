@@ -139,7 +139,7 @@ def _facts(reported: Reported, findings: Findings) -> StudyFacts:
         final_episodes=reported.final_episodes,
         is_online=reported.is_online,
         ablations=reported.ablations,
-        notices=reported.notices,
+        notices=[*_notes(reported), *reported.notices],
     )
 
 
@@ -193,3 +193,9 @@ def _write_run_page(page: Page, path: Path) -> None:
     text = render_page(page, None, bundle_file=f"../{BUNDLE}")
     with replaced_file(path, "w", encoding="utf-8") as file:
         file.write(text)
+
+
+def _notes(reported: Reported) -> list[str]:
+    """Return what has to be said of algorithms that are not decentralised, as their runs have noted it."""
+    notes = {run.arm: str(run.data.record.get("note") or "") for run in reported.runs}
+    return [f"{arm} {notes[arm]}." for arm in reported.arms if notes.get(arm)]

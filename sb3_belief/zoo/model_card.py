@@ -106,13 +106,14 @@ def _ends(value: Any) -> list[float] | None:
 
 
 def _text(content: CardContent) -> str:
-    record, repo_id = content.record, content.repo_id
+    record, repo_id, note = content.record, content.repo_id, content.record.get("note")
     kinds = sorted(set(content.algorithms.values()))
     rows = {
         "Environment": f"`{record['env']}`",
         "Arguments of the environment": f"`{json.dumps(content.settings.get('env_kwargs', {}))}`".replace("|", "\\|"),
-        "Algorithm": f"`{record['algo']}` ({', '.join(kinds)})",
-        "Agents": f"{len(content.algorithms)}, each with a model of its own: {', '.join(map(_code, content.algorithms))}",
+        "Algorithm": f"`{record['algo']}` ({', '.join(kinds)})" + (f": {note}" if note else ""),
+        "Models" if note else "Agents": f"{len(content.algorithms)}{'' if note else ', each with a model of its own'}:"
+        f" {', '.join(map(_code, content.algorithms))}",
         "Joint steps of training": f"{content.joint_steps:,}",
         "Seed": f"{record.get('seed')}",
     }
@@ -125,8 +126,12 @@ def _text(content: CardContent) -> str:
     }
     parts = [
         f"# {repo_id.rpartition('/')[2]}",
-        "A team that was trained with sb3-belief: each agent is a model of"
-        " Stable-Baselines3 that has learned by itself from what it observed itself.",
+        "A team that was trained with sb3-belief"
+        + (
+            f". It {note}."
+            if note
+            else ": each agent is a model of Stable-Baselines3 that has learned by itself from what it observed itself."
+        ),
         _table({"": "", **rows}),
         "## Score",
         _score(content),

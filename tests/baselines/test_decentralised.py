@@ -123,7 +123,7 @@ def test_nothing_in_them_depends_on_the_global_state(name):
         learned.append(team.learn(32))
     for agent, model in learned[0].agents.items():
         assert th.equal(parameters(model), parameters(learned[1].agents[agent]))
-        buffers = [getattr(team.agents[agent], "replay_buffer", None) for team in learned]
+        buffers: list[Any] = [getattr(team.agents[agent], "replay_buffer", None) for team in learned]
         if buffers[0] is not None:
             assert np.array_equal(buffers[0].observations, buffers[1].observations)
 
