@@ -75,6 +75,14 @@ def test_climbing(seed):
 
 
 @pytest.mark.slow
+def test_the_huber_loss_fits_no_means_where_errors_are_large():
+    first, second = values("climbing", 0, 1.0, n_timesteps=100_000, n_steps=25)
+    # Where the sum of the errors, cut off at 1 and -1, is zero
+    assert first[0] == pytest.approx([0, 0, 5], abs=0.3)
+    assert second[0] == pytest.approx([0, 6, 0.5], abs=0.3)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("k", "seed"), [*product([-25], SEEDS), *product([-50, -100], [0])])
 def test_penalty(k, seed):
     tables = values("penalty", seed, 0.5 / (10 - k), n_timesteps=200_000, n_steps=25, k=k)
