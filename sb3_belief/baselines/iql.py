@@ -200,17 +200,18 @@ class IQL(DQN):
 
     # Learning
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self._last_obs is None or self._starts_anew(*args, **kwargs) or len(self._between_lives) != self.n_envs:
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None or len(self._between_lives) != self.n_envs:
+            # SB3 resets the environment
             self._between_lives = np.zeros(self.n_envs, dtype=bool)
-        return super()._setup_learn(*args, **kwargs)
-
-    @staticmethod
-    def _starts_anew(
-        total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *_: Any, **__: Any
-    ) -> bool:
-        # SB3 resets the environment then
-        return reset_num_timesteps
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _store_transition(
         self,

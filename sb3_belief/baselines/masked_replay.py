@@ -6,6 +6,7 @@ The masks reach the target network as an argument, although SB3's ``train()`` kn
 next observations of a minibatch, which SB3 only passes on (see :func:`~sb3_belief.belief_ppo.buffers.attach`).
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief_ppo.buffers import attach
-from sb3_belief.vec_env.observation_forms import map_parts
 
 if TYPE_CHECKING:
     _Buffer = ReplayBuffer
@@ -78,7 +78,7 @@ class MaskedReplayMixin(_Buffer):
         :return: The samples
         """
         obs, next_obs = (
-            map_parts(self.to_torch, self._normalize_obs(map_parts(lambda part: part[rows, copies], stored), env))
+            _each(self.to_torch, self._normalize_obs(_each(lambda part: part[rows, copies], stored), env))
             for stored in (self.observations, self.next_observations)
         )
         # A return that was cut off goes on after the last observation
@@ -91,6 +91,11 @@ class MaskedReplayMixin(_Buffer):
             dones=self.to_torch(ended.reshape(-1, 1)),
             rewards=self.to_torch(rewards),
         )
+
+
+def _each(function: Callable[[Any], Any], parts: Any) -> Any:
+    """Apply a function to an array, or to each one of a dict."""
+    return {key: function(part) for key, part in parts.items()} if isinstance(parts, dict) else function(parts)
 
 
 class MaskedReplayBuffer(MaskedReplayMixin, ReplayBuffer):

@@ -60,9 +60,9 @@ def played(env, n_steps=40, agent="agent_0", **kwargs) -> Any:
 # Its likeness to DQN
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_without_masks_and_double_q_it_is_dqn_weight_for_weight(n_envs, monkeypatch):
-    kwargs = {**Q_KWARGS, "seed": 0}
+@pytest.mark.parametrize(("n_envs", "normalize"), [(1, False), (3, False), (1, True)])
+def test_without_masks_and_double_q_it_is_dqn_weight_for_weight(n_envs, normalize, monkeypatch):
+    kwargs = {**Q_KWARGS, "seed": 0, "normalize": normalize}
     if n_envs > 1:
         # One coin for all copies and one for each take a different number of random numbers: none is tossed
         monkeypatch.setattr(np.random, "rand", lambda *shape: np.ones(shape))
@@ -228,6 +228,26 @@ def test_masks_at_a_limit_are_those_of_the_old_episode():
     masks = model.replay_buffer.next_masks
     # Step 7 of the old episode, action 7 % 3; the next one begins with action 0
     assert masks[6].tolist() == [[False, True, False]] * 2 and masks[5].tolist() == [[True, False, False]] * 2
+
+
+def test_who_is_cut_off_before_the_others_has_its_own_last_mask():
+    class Leaves(ToyEnv):
+        """The first agent is cut off at step 4 and leaves; its mask then allows action 2 alone."""
+
+        def infos(self):
+            return {agent: {"action_mask": np.arange(3) == 2 if self.t == 4 else np.ones(3, bool)} for agent in self.agents}
+
+        def step(self, actions):
+            obs, rewards, ends, cuts, infos = super().step(actions)
+            if self.t == 4:
+                cuts["agent_0"] = True
+                self.agents = ["agent_1"]
+            return obs, rewards, ends, cuts, infos
+
+    buffer = played(make_team_env(Leaves, n_envs=1, seed=0), 7).replay_buffer
+    assert buffer.timeouts[:7, 0].tolist() == [0, 0, 0, 1, 0, 0, 0]
+    assert buffer.next_masks[:4, 0].sum(axis=1).tolist() == [3, 3, 3, 1] and buffer.next_masks[3, 0, 2]
+    assert buffer.learnable[:7, 0].tolist() == [True] * 4 + [False] * 3
 
 
 def test_where_an_environment_does_not_say_its_last_masks_all_actions_count():

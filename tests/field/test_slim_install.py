@@ -35,6 +35,8 @@ def run(code, *args, cwd=ROOT):
     [
         "from sb3_belief import BeliefPPO",
         "from sb3_belief.belief_ppo import BeliefPPO, BeliefActorCriticPolicy, OthersPrediction",
+        "from sb3_belief.baselines.iql import IQL",
+        "from sb3_belief.baselines.dpiqn import DPIQN, DRPIQN",
     ],
 )
 def test_nothing_is_imported_that_an_agent_does_not_need(line):

@@ -43,14 +43,11 @@ def test_a_run_trains_evaluates_resumes_and_is_shown(tmp_path, capsys):
 
 
 def test_a_run_with_windows_trains_evaluates_resumes_and_is_shown(tmp_path, capsys):
-    small = (
-        "n_envs:2",
-        "buffer_size:200",
-        "batch_size:8",
-        "learning_starts:16",
-        "observe_window:3",
-        "policy_kwargs.net_arch:[8]",
-    )
+    # Epsilon is constant, since it falls by the share of the whole training
+    small = [
+        *("n_envs:2", "buffer_size:200", "batch_size:8", "learning_starts:16", "observe_window:3"),
+        *("policy_kwargs.net_arch:[8]", "exploration_initial_eps:0.3", "exploration_final_eps:0.3"),
+    ]
 
     def given(folder, total):
         return [
