@@ -13,6 +13,7 @@ LAYERS = [
     {"belief_ppo", "vec_env"},
     {"envs"},
     {"team"},
+    {"references"},
     {"report", "export"},
     {"zoo"},
     {"study"},
