@@ -8,7 +8,8 @@ from torch import nn
 
 class AgentValues(NamedTuple):
     """
-    Values of all agents' actions in ``B`` joint observations.
+    Values of all agents' actions in ``B`` joint observations, or in the steps ``[B, T]`` of episodes, which :meth:`rows` makes
+    rows of.
 
     :param q: ``Q_i(u)`` for each action, ``[B, n, U]``; minus infinity where the action is not legal
     :param features: What the agents' last layers were given, ``[B, n, h]``
@@ -18,6 +19,15 @@ class AgentValues(NamedTuple):
     q: th.Tensor
     features: th.Tensor
     state: th.Tensor
+
+    def rows(self, steps: slice) -> "AgentValues":
+        """
+        Return some steps of episodes as joint observations.
+
+        :param steps: Which of the ``T`` steps
+        :return: Values of ``B`` times as many joint observations
+        """
+        return AgentValues(*(part[:, steps].flatten(0, 1) for part in self))
 
     def greedy(self) -> th.Tensor:
         """Return each agent's best legal action, that of the lowest index where several are: int64 ``[B, n]``."""

@@ -38,8 +38,8 @@ class EpisodeReplayBuffer(ReplayBuffer):
     """
     The last ``buffer_size`` episodes of all copies of the environment.
 
-    An episode is there from its end on. SB3's own buffers count and draw single steps, from which neither a recurrent network
-    nor a return over several steps can be computed.
+    An episode is there from its end on, if it was recorded from its beginning, which :meth:`begin` says. SB3's own buffers
+    count and draw single steps, from which neither a recurrent network nor a return over several steps can be computed.
 
     :param buffer_size: Number of episodes, at least 1
     :param observation_space: That of a ``JointVecEnv``
@@ -61,7 +61,8 @@ class EpisodeReplayBuffer(ReplayBuffer):
         # Not ReplayBuffer's: it allocates arrays of single steps
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         self.episodes: list[dict[str, np.ndarray]] = []
-        self._open: list[list[dict[str, Any]]] = [[] for _ in range(n_envs)]
+        # The steps of the episodes under way; None until one begins
+        self._open: list[list[dict[str, Any]] | None] = [None] * n_envs
 
     def size(self) -> int:
         """Return the number of episodes."""
@@ -69,13 +70,13 @@ class EpisodeReplayBuffer(ReplayBuffer):
 
     def reset(self) -> None:
         self.episodes, self.pos, self.full = [], 0, False
-        self.drop_open(np.ones(self.n_envs, dtype=bool))
+        self._open = [None] * self.n_envs
 
-    def drop_open(self, where: np.ndarray) -> None:
+    def begin(self, where: np.ndarray) -> None:
         """
-        Forget the steps of episodes that have not ended, since they never will.
+        Begin an episode. What there is of the one before is forgotten, if it has not ended.
 
-        :param where: The copies in which an episode begins, bool ``[n_envs]``
+        :param where: The copies in which it begins, bool ``[n_envs]``
         """
         for i in np.flatnonzero(where):
             self._open[i] = []
@@ -100,14 +101,17 @@ class EpisodeReplayBuffer(ReplayBuffer):
         :param infos: Of which ``TimeLimit.truncated`` is read
         """
         for i, steps in enumerate(self._open):
+            if steps is None:
+                continue
             steps.append(
                 {**{key: np.array(obs[key][i]) for key in KEYS}, "actions": np.array(action[i]), "rewards": float(reward[i])}
             )
             if done[i]:
-                self._close(i, {key: np.array(next_obs[key][i]) for key in KEYS}, infos[i].get("TimeLimit.truncated", False))
+                self._open[i] = None
+                last = {key: np.array(next_obs[key][i]) for key in KEYS}
+                self._keep(steps, last, infos[i].get("TimeLimit.truncated", False))
 
-    def _close(self, i: int, last: dict[str, np.ndarray], truncated: bool) -> None:
-        steps, self._open[i] = self._open[i], []
+    def _keep(self, steps: list[dict[str, Any]], last: dict[str, np.ndarray], truncated: bool) -> None:
         episode = {key: np.stack([*(step[key] for step in steps), last[key]]) for key in KEYS}
         episode["mask"] = episode["mask"].astype(bool)
         episode["actions"] = np.stack([step["actions"] for step in steps]).astype(np.int64)

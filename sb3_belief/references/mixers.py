@@ -4,6 +4,8 @@ Mixers: how the values of the agents' own actions make the value of the joint on
 Each is ``forward(q_taken, q_max, u_onehot, state) -> [B, 1]``.
 """
 
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 
 import torch as th
@@ -124,9 +126,9 @@ class QPLEX(Mixer):
         self.w = _hypernet(state_dim, n_agents, hypernet_dim)
         self.b = _hypernet(state_dim, n_agents, hypernet_dim)
         joint_dim = state_dim + n_agents * n_actions
-        self.keys = nn.ModuleList(_layers(state_dim, 1, hypernet_dim, n_layers) for _ in range(n_kernels))
-        self.agents = nn.ModuleList(_layers(state_dim, n_agents, hypernet_dim, n_layers) for _ in range(n_kernels))
-        self.actions = nn.ModuleList(_layers(joint_dim, n_agents, hypernet_dim, n_layers) for _ in range(n_kernels))
+        self.keys = _layers(state_dim, 1, hypernet_dim, n_layers, partial(ParallelLinear, n_kernels))
+        self.agents = _layers(state_dim, n_agents, hypernet_dim, n_layers, partial(ParallelLinear, n_kernels))
+        self.actions = _layers(joint_dim, n_agents, hypernet_dim, n_layers, partial(ParallelLinear, n_kernels))
 
     def forward(self, q_taken: th.Tensor, q_max: th.Tensor, u_onehot: th.Tensor, state: th.Tensor) -> th.Tensor:
         w = self.w(state).abs() + _TINY
@@ -143,20 +145,44 @@ class QPLEX(Mixer):
         :return: ``[B, n]``
         """
         joint = th.cat([state, u_onehot.flatten(1)], dim=-1)
-        kernels = [
-            (key(state).abs() + _TINY) * agent(state).sigmoid() * action(joint).sigmoid()
-            for key, agent, action in zip(self.keys, self.agents, self.actions, strict=True)
-        ]
-        return th.stack(kernels).sum(dim=0)
+        keys, agents, actions = self.keys(state).abs() + _TINY, self.agents(state).sigmoid(), self.actions(joint).sigmoid()
+        return (keys * agents * actions).sum(dim=0)
 
 
-def _layers(n_in: int, n_out: int, hidden_dim: int, n_layers: int) -> nn.Sequential:
+class ParallelLinear(nn.Module):
+    """
+    Several linear layers of one shape, side by side: a single product instead of one for each.
+
+    :param n_layers: Number of layers ``k``
+    :param n_in: Width of their inputs
+    :param n_out: Width of their outputs
+    """
+
+    def __init__(self, n_layers: int, n_in: int, n_out: int):
+        super().__init__()
+        layers = [nn.Linear(n_in, n_out) for _ in range(n_layers)]
+        self.weight = nn.Parameter(th.stack([layer.weight.detach().T for layer in layers]))
+        self.bias = nn.Parameter(th.stack([layer.bias.detach() for layer in layers])[:, None])
+
+    def forward(self, rows: th.Tensor) -> th.Tensor:
+        """
+        Pass rows.
+
+        :param rows: ``[B, n_in]`` for all layers, or ``[k, B, n_in]``
+        :return: ``[k, B, n_out]``
+        """
+        return rows @ self.weight + self.bias
+
+
+def _layers(
+    n_in: int, n_out: int, hidden_dim: int, n_layers: int, make: Callable[[int, int], nn.Module] = nn.Linear
+) -> nn.Sequential:
     """Return ``n_layers`` linear layers with ReLU between them."""
     widths = [n_in, *[hidden_dim] * (n_layers - 1)]
     modules: list[nn.Module] = []
     for before, after in pairwise(widths):
-        modules += [nn.Linear(before, after), nn.ReLU()]
-    return nn.Sequential(*modules, nn.Linear(widths[-1], n_out))
+        modules += [make(before, after), nn.ReLU()]
+    return nn.Sequential(*modules, make(widths[-1], n_out))
 
 
 def _hypernet(state_dim: int, n_out: int, hidden_dim: int | None) -> nn.Sequential:

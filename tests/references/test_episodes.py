@@ -35,8 +35,11 @@ def replay(buffer_size=10, n_envs=2):
 
 
 def play(buffer, steps):
-    """Add steps of copy 0 with a number each: (number, next number, reward, done, truncated)."""
+    """Add steps of the only copy with a number each: (number, next number, reward, done, truncated)."""
+    starts = np.array([True])
     for number, after, reward, done, truncated in steps:
+        buffer.begin(starts)
+        starts = np.array([done])
         buffer.add(
             joint_obs([number]),
             joint_obs([after]),
@@ -70,7 +73,7 @@ def test_an_episode_is_there_from_its_end_on():
     buffer = replay(n_envs=1)
     play(buffer, [(1, 2, 0.5, False, False)])
     assert buffer.size() == 0
-    play(buffer, [(2, 3, 1.5, True, False)])
+    buffer.add(joint_obs([2]), joint_obs([3]), np.array([[0, 1]]), np.array([1.5]), np.array([True]), [{}])
     assert buffer.size() == 1
     batch = buffer.sample(1)
     assert batch.obs[0, :, 0, 0].tolist() == [1, 2, 3] and batch.state[0, :, 0].tolist() == [1, 2, 3]
@@ -102,24 +105,32 @@ def test_the_oldest_makes_room():
 
 def test_copies_do_not_mix():
     buffer = replay(n_envs=2)
+    buffer.begin(np.array([True, True]))
     for t in range(2):
         done = np.array([t == 1, False])
         buffer.add(joint_obs([t, 10 + t]), joint_obs([t + 1, 11 + t]), np.ones((2, N)), np.array([1.0, 2.0]), done, [{}, {}])
     assert buffer.size() == 1 and buffer.sample(1).rewards.tolist() == [[1.0, 1.0]]
 
 
-def test_steps_of_an_episode_that_was_given_up_are_dropped():
+def test_steps_of_an_episode_that_was_given_up_are_forgotten():
     buffer = replay(n_envs=1)
     play(buffer, [(1, 2, 9.0, False, False)])
-    buffer.drop_open(np.array([True]))
     play(buffer, [(5, 6, 1.0, True, False)])
     assert buffer.sample(1).rewards.tolist() == [[1.0]]
+
+
+def test_an_episode_whose_beginning_is_not_known_is_left_out():
+    buffer = replay(n_envs=1)
+    for done in (False, True):
+        buffer.add(joint_obs([1]), joint_obs([2]), np.array([[0, 1]]), np.array([1.0]), np.array([done]), [{}])
+    assert buffer.size() == 0
 
 
 def test_what_the_environment_overwrites_is_kept():
     buffer = replay(n_envs=1)
     obs, actions = {key: value.copy() for key, value in joint_obs([1]).items()}, np.ones((1, N), dtype=int)
-    buffer.add(obs, joint_obs([2]), actions, np.array([1.0]), np.array([False]), [{}])
-    obs["obs"][:], actions[:] = 99, 0
-    play(buffer, [(2, 3, 1.0, True, False)])
+    buffer.begin(np.array([True]))
+    for done in (False, True):
+        buffer.add(obs, joint_obs([2]), actions, np.array([1.0]), np.array([done]), [{}])
+        obs["obs"][:], actions[:] = 99, 0
     assert buffer.sample(1).obs[0, 0, 0, 0] == 1 and buffer.sample(1).actions[0, 0, 0] == 1

@@ -1,13 +1,14 @@
 """The mixers' defining equations, by hand."""
 
 import itertools
+from typing import Any
 
 import pytest
 import torch as th
 from torch import nn
 
 from sb3_belief.references.agent_net import AgentValues
-from sb3_belief.references.mixers import QMIX, QPLEX, VDN, Mixer
+from sb3_belief.references.mixers import QMIX, QPLEX, VDN, Mixer, ParallelLinear
 from sb3_belief.references.qtran import QTRAN
 
 STATE = th.zeros(1, 1)
@@ -15,7 +16,7 @@ STATE = th.zeros(1, 1)
 
 def constant(network: nn.Module, values) -> None:
     """Have a network return the same whatever it is given."""
-    linear = [module for module in network.modules() if isinstance(module, nn.Linear)][-1]
+    linear: Any = [module for module in network.modules() if isinstance(module, nn.Linear | ParallelLinear)][-1]
     linear.weight.data.zero_()
     linear.bias.data = th.as_tensor(values, dtype=th.float32).reshape(linear.bias.shape)
 
@@ -58,9 +59,9 @@ def test_qplex_by_hand():
     constant(mixer.w, [1, -2])
     constant(mixer.b, [0, 1])
     # lambda = 2 * (1, 1/4) * 1
-    constant(mixer.keys[0], -2)
-    constant(mixer.agents[0], [40, -th.log(th.tensor(3.0))])
-    constant(mixer.actions[0], [40, 40])
+    constant(mixer.keys, -2)
+    constant(mixer.agents, [40, -th.log(th.tensor(3.0))])
+    constant(mixer.actions, [40, 40])
     assert mixed(mixer, [1.0, 0.0], [1.0, 3.0]) == pytest.approx(5, abs=1e-4)
     assert mixed(mixer, [1.0, 3.0], [1.0, 3.0]) == pytest.approx(8, abs=1e-4)
 
@@ -88,8 +89,17 @@ def test_qplex_importance_depends_on_state_and_actions(n_layers):
     at = mixer.importance(first, STATE)
     assert at.shape == (1, 2) and (at > 0).all()
     assert not th.equal(at, mixer.importance(second, STATE)) and not th.equal(at, mixer.importance(first, STATE + 1))
-    n_linear = sum(isinstance(module, nn.Linear) for module in mixer.keys.modules())
-    assert n_linear == 2 * n_layers
+    assert sum(isinstance(module, ParallelLinear) for module in mixer.keys.modules()) == n_layers
+
+
+def test_parallel_layers_are_layers_of_their_own():
+    layers = ParallelLinear(3, 4, 2)
+    first = nn.Linear(4, 2)
+    layers.weight.data[1], layers.bias.data[1, 0] = first.weight.data.T, first.bias.data
+    rows = th.randn(5, 4)
+    out = layers(rows)
+    assert out.shape == (3, 5, 2) and th.allclose(out[1], first(rows), atol=1e-6) and not th.allclose(out[0], out[2])
+    assert th.allclose(layers(rows.expand(3, -1, -1)), out)
 
 
 def test_qplex_advantage_passes_no_gradient():
