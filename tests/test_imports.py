@@ -13,7 +13,7 @@ LAYERS = [
     {"belief_ppo", "vec_env"},
     {"envs"},
     {"team"},
-    {"references"},
+    {"baselines", "references"},
     {"report", "export"},
     {"zoo"},
     {"study"},

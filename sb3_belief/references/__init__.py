@@ -1,1 +1,1 @@
-"""Centralised references of the comparison set: each uses the global state in training."""
+"""What the paper compares with that trains centrally: with the global state, all agents' actions, or shared weights."""

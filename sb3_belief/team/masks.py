@@ -11,6 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.common.exceptions import add_note
+from sb3_belief.team.model_parts import shown_space
 from sb3_belief.team.predictor import takes_masks
 from sb3_belief.vec_env.action_masks import mask_parts
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
@@ -23,14 +24,19 @@ class MaskCheck:
     """
     Watches whether agents without masks choose impossible actions while they are in play, in the first joint steps.
 
-    A mask that only says what an agent may do while it is out of play concerns nobody, so the masks alone do not tell.
+    A mask that only says what an agent may do while it is out of play concerns nobody, so the masks alone do not tell. A model
+    that acts for several agents is not watched, since it is in play as long as one of them is.
 
     :param models: The models by agent
     :param masks: The masks after a reset by agent, bool ``[n_envs, k]``; None without masks
     """
 
     def __init__(self, models: Mapping[str, BaseAlgorithm], masks: Mapping[str, np.ndarray] | None):
-        self._models = {agent: models[agent] for agent in masks or {} if not takes_masks(models[agent])}
+        self._models = {
+            agent: models[agent]
+            for agent in masks or {}
+            if not takes_masks(models[agent]) and shown_space(models[agent], "action") == models[agent].action_space
+        }
         self._agents = list(models)
         self._n_steps = 0
         #: Whether there is nothing to watch any more

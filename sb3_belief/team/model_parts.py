@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from torch import nn
@@ -47,3 +48,14 @@ def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
     while isinstance(env, VecEnvWrapper):
         yield env
         env = env.venv
+
+
+def shown_space(model: BaseAlgorithm, kind: str) -> spaces.Space:
+    """
+    Return the space of what a model is shown in the team's environment, or of what it does there.
+
+    :param model: A model. One that cuts what it is shown into rows, whose spaces are its own, has ``team_observation_space``
+        and ``team_action_space``
+    :param kind: ``"observation"`` or ``"action"``
+    """
+    return getattr(model, f"team_{kind}_space", getattr(model, f"{kind}_space"))

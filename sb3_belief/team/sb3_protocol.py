@@ -23,6 +23,7 @@ from sb3_belief.team.arguments import check_agent_keys, check_same_agents, check
 from sb3_belief.team.checkpoint import read_team
 from sb3_belief.team.lockstep.joint_loop import JointLoop
 from sb3_belief.team.logs import TeamLog, record_statistics, record_time
+from sb3_belief.team.model_parts import shown_space
 
 # Arguments of algorithms that a team has itself
 _OWN = {"policy", "env", "seed", "verbose", "tensorboard_log"}
@@ -156,12 +157,12 @@ class SB3Protocol:
     @property
     def observation_space(self) -> spaces.Dict:
         """The agents' observation spaces by agent."""
-        return spaces.Dict({agent: model.observation_space for agent, model in self._models.items()})
+        return spaces.Dict({agent: shown_space(model, "observation") for agent, model in self._models.items()})
 
     @property
     def action_space(self) -> spaces.Dict:
         """The agents' action spaces by agent."""
-        return spaces.Dict({agent: model.action_space for agent, model in self._models.items()})
+        return spaces.Dict({agent: shown_space(model, "action") for agent, model in self._models.items()})
 
     def observed_by(self, agent: str, observation: Any) -> Any:
         """

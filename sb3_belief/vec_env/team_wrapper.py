@@ -20,6 +20,7 @@ class TeamVecEnvWrapper(TeamVecEnv):
     :param venv: The environment within
     :param observation_spaces: Observation space of each agent that is one to the outside, in place of that of ``venv``
     :param scripted_action_spaces: Action spaces of the others who act within. None for those of ``venv``
+    :param action_spaces: Action space of each agent that is one to the outside. None for those of ``venv``
     """
 
     def __init__(
@@ -27,6 +28,7 @@ class TeamVecEnvWrapper(TeamVecEnv):
         venv: TeamVecEnv,
         observation_spaces: Mapping[str, spaces.Space],
         scripted_action_spaces: Mapping[str, spaces.Space] | None = None,
+        action_spaces: Mapping[str, spaces.Space] | None = None,
     ):
         #: The environment within
         self.venv = venv
@@ -35,7 +37,7 @@ class TeamVecEnvWrapper(TeamVecEnv):
             venv.num_envs,
             list(observation_spaces),
             observation_spaces,
-            {agent: acted[agent] for agent in observation_spaces},
+            {agent: acted[agent] for agent in observation_spaces} if action_spaces is None else action_spaces,
             render_mode=venv.render_mode,
             scripted_action_spaces=venv.scripted_action_spaces if scripted_action_spaces is None else scripted_action_spaces,
         )

@@ -9,7 +9,7 @@ the section and the key. Nothing is created before all of them have been checked
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -19,9 +19,10 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
-from sb3_belief.zoo.names import get_algo, get_env, load_env
+from sb3_belief.zoo.names import Algo, get_algo, get_env, load_env
 from sb3_belief.zoo.partners import PartnersConfig, partners_config
 from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker, observation_arguments
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
@@ -73,6 +74,8 @@ class RunConfig:
     :param eval_env_kwargs: Arguments of the environment of evaluations, which override ``env_kwargs``
     :param agents: The agents with settings of their own
     :param partners: The agents that act and do not learn; None if all learn
+    :param adapter: Makes of the agents' environment the one in which a central learner learns and acts; None for the agents'
+    :param note: What every place has to say that names the algorithm; empty for nothing
     :param origins: Where each setting comes from: the file and its section, or the flag
     """
 
@@ -94,6 +97,8 @@ class RunConfig:
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
     agents: dict[str, AgentConfig] = field(default_factory=dict)
     partners: PartnersConfig | None = None
+    adapter: Callable[[TeamVecEnv], TeamVecEnv] | None = None
+    note: str = ""
     origins: dict[str, str] = field(default_factory=dict)
 
     def origin(self, message: str = "") -> str:
@@ -205,7 +210,7 @@ def load_config(
     chosen = get_algo(algo, f"{span_source}: memory_span", span)
     agents = {}
     for agent, own in _agent_settings(layers).items():
-        own_algo = get_algo(own.get("algo", algo), f"{_last(layers, 'agent_kwargs')[0]}: agent_kwargs: {agent}: algo", span)
+        own_algo = _beside(own.get("algo", algo), algo, f"{_last(layers, 'agent_kwargs')[0]}: agent_kwargs: {agent}", span)
         agents[agent] = SettingsChecker(own_algo, make_env, n_leading, own.get("policy", policy))
     checker = SettingsChecker(chosen, make_env, n_leading, policy, agents)
     settings: dict[str, Any] = {}
@@ -226,6 +231,8 @@ def load_config(
         location = Location(f"{origins['partners']}: partners", extra_packages)
         checked["partners"] = partners_config(checked["partners"], location)
     config = _to_run_config(algo, env_id, settings, str(path), checker.algo_class, {**checked, **chosen.fixed}, origins)
+    adapter = checker.adapter and partial(checker.adapter, **checked.get("adapter_kwargs", {}))
+    config = replace(config, adapter=adapter, note=chosen.note)
     _check_episodic(config)
     return config
 
@@ -280,6 +287,16 @@ def _last(layers: Sequence[tuple[Location, dict[str, Any]]], key: str) -> tuple[
     """Return the source that decides a setting, and its value there. An empty text and None if no source has it."""
     found = [(location.text, layer[key]) for location, layer in layers if key in layer]
     return found[-1] if found else ("", None)
+
+
+def _beside(name: Any, common: str, where: str, span: Any) -> Algo:
+    """Return the algorithm of an agent beside those of the algorithm ``common``."""
+    algo = get_algo(name, f"{where}: algo", span)
+    if algo.adapter != get_algo(common).adapter:
+        raise ConfigError(
+            f"{where}: {name} and {common} do not learn side by side: one sees more than an agent of its own does."
+        )
+    return algo
 
 
 def _agent_settings(layers: Sequence[tuple[Location, dict[str, Any]]]) -> dict[str, dict[str, Any]]:

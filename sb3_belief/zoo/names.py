@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_belief.common.safe_files.trust import is_allowed
 from sb3_belief.envs.registry import EnvSpec, registered_ids, spec
 from sb3_belief.envs.suites import SUITES
+from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 from sb3_belief.zoo.errors import ConfigError, cause, short, suggestion, unknown_setting
 
 #: The packages, or parts of packages, into which a dotted path in a YAML file may point
@@ -49,11 +50,18 @@ class Algo:
     :param fixed: Constructor arguments that the name implies. A configuration cannot change them
     :param partner_memory: ``"module:class"`` of the same with a memory that lasts as long as a partner stays; empty if there
         is none
+    :param adapter: ``"module:function"`` that makes of a team's environment the one in which the algorithm learns and acts,
+        for algorithms that learn centrally; empty for the agents' own. It takes the ``TeamVecEnv`` and the settings
+        ``adapter_kwargs``, and returns a ``TeamVecEnv``: of the same agents, who see more, or of a single one, which acts
+        for all (``references.one_learner.OneLearnerVecEnv``). Nothing else in the zoo tells such a learner from a team
+    :param note: What every place has to say that names the algorithm; empty for nothing
     """
 
     path: str
     fixed: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     partner_memory: str = ""
+    adapter: str = ""
+    note: str = ""
 
     def load(self) -> type[BaseAlgorithm]:
         """
@@ -61,15 +69,38 @@ class Algo:
 
         :return: Its class
         """
-        module, _, name = self.path.partition(":")
-        return getattr(importlib.import_module(module), name)
+        return _import(self.path)
+
+    def load_adapter(self) -> Callable[..., TeamVecEnv] | None:
+        """
+        Import the adapter.
+
+        :return: The function; None if there is none
+        """
+        return _import(self.adapter) if self.adapter else None
+
+
+def _import(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+#: What is said of models that all agents have in common
+SHARED = "shares weights: not decentralised"
+_NO_BELIEF: Mapping[str, Any] = MappingProxyType({"belief": "none"})
+_SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
 
 
 #: The algorithms whose unmodified ``learn()`` runs in a team. ARS is not among them, because it steps its environments itself
 ALGOS: Mapping[str, Algo] = MappingProxyType(
     {
         "belief_ppo": Algo("sb3_belief.belief_ppo:BeliefPPO"),
-        "ippo": Algo("sb3_belief.belief_ppo:BeliefPPO", MappingProxyType({"belief": "none"})),
+        "ippo": Algo("sb3_belief.belief_ppo:BeliefPPO", _NO_BELIEF),
+        "ippo_wide": Algo("sb3_belief.belief_ppo:BeliefPPO", MappingProxyType({"belief": "wide"})),
+        "ippo_shared": Algo("sb3_belief.references.shared:SharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED),
+        "maskable_ippo_shared": Algo(
+            "sb3_belief.references.shared:MaskableSharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED
+        ),
         "maskable_belief_ppo": Algo("sb3_belief.belief_ppo:MaskableBeliefPPO"),
         "ppo": Algo("stable_baselines3:PPO"),
         "a2c": Algo("stable_baselines3:A2C"),

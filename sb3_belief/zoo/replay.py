@@ -58,6 +58,7 @@ class ShownEnvironment:
     :param observation: Further arguments of it: what agents observe besides
     :param partners: The agents that are not of the team; None if all are
     :param visibility: Argument of ``make_team_env``: what agents see of the others is what they observe, and remember
+    :param adapter: Makes of the agents' environment that of a central learner; None for a team of agents
     """
 
     env_id: str
@@ -67,6 +68,7 @@ class ShownEnvironment:
     observation: dict[str, Any] = field(default_factory=dict)
     partners: PartnersConfig | None = None
     visibility: Callable[[Any], Any] | None = None
+    adapter: Callable[[TeamVecEnv], TeamVecEnv] | None = None
 
 
 def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironment:
@@ -103,6 +105,7 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
         observation=config.observation,
         partners=partners,
         visibility=config.visibility,
+        adapter=config.adapter,
     )
 
 
@@ -171,7 +174,8 @@ def make_shown_env(shown: ShownEnvironment, saved: ShownTeam, n_envs: int, seed:
         )
         if shown.partners is not None:
             env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
-        return with_last_step(env, **shown.observation)
+        env = with_last_step(env, **shown.observation)
+        return env if shown.adapter is None else shown.adapter(env)
 
 
 def load_into(path: Path, env: TeamVecEnv, saved: ShownTeam, command: str) -> Team:

@@ -34,6 +34,7 @@ RUN_KEYS: dict[str, Any] = {
     "callback": str | list[Any] | dict[str, Any] | None,
     "agent_kwargs": dict[str, dict[str, Any]],
     "partners": dict[str, Any] | None,
+    "adapter_kwargs": dict[str, Any],
 }
 # The settings that agent_kwargs may give a single agent, besides the arguments of its algorithm
 _AGENT_KEYS = {"algo": str, "policy": str, "policy_kwargs": dict[str, Any]}
@@ -74,7 +75,7 @@ class SettingsChecker:
         policy: Any,
         agents: Mapping[str, "SettingsChecker"] | None = None,
     ) -> None:
-        self.algo_class = algo.load()
+        self.algo_class, self.adapter = algo.load(), algo.load_adapter()
         self.make_env, self.n_leading, self.agents = make_env, n_leading, agents or {}
         self.policies = self.algo_class.policy_aliases
         self.policy_class = self.policies.get(policy) if isinstance(policy, str) else None
@@ -126,8 +127,8 @@ class SettingsChecker:
         value = check_value(value, RUN_KEYS[key], location)
         if key in ("n_envs", "n_timesteps", "policy_kwargs", "normalize"):
             check_limits({key: value}, location.parent)
-        if key == "partners":
-            return check_partners(value, location)
+        if key in ("partners", "adapter_kwargs"):
+            return check_partners(value, location) if key == "partners" else self._check_adapter_kwargs(value, location)
         if key == "agent_kwargs":
             return {agent: self.agents[agent]._check_agent(own, location.key(agent)) for agent, own in value.items()}
         if key == "memory_span" and value not in MEMORY_SPANS:
@@ -154,6 +155,11 @@ class SettingsChecker:
                 check_limits(kwargs, location.key(callback.__name__).text)
             return callbacks
         return value
+
+    def _check_adapter_kwargs(self, value: Any, location: Location) -> dict[str, Any]:
+        if self.adapter is None:
+            raise ConfigError(f"{location.text}: agents of this algorithm learn from what they see themselves: leave it out.")
+        return check_call(self.adapter, value, location, skip=1)
 
     def _check_policy_kwargs(self, policy_class: type, value: Any, location: Location) -> dict[str, Any]:
         checked = check_call(policy_class, value, location, reserved=self.policy_reserved)

@@ -79,6 +79,7 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
             folder,
             options.command,
             algo=config.algo,
+            note=config.note,
             env=config.env_id,
             seed=seed,
             source=config.source,
@@ -97,6 +98,8 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
             env.start_monitor(str(folder))
             if options.verbose:
                 print(f"Run folder: {folder}  (seed {seed})")
+                if config.note:
+                    print(f"{config.algo} {config.note}.")
             # A team that continues its training continues counting its steps
             return learn_and_save(team, config, options, folder, record, callbacks, signals, trained is None)
 
@@ -231,7 +234,8 @@ def make_env(
         env = with_config_partners(config, env, evaluation, trust_pickle)
     try:
         # Around the partners, who observe what they have learned with
-        return with_last_step(env, **config.observation)
+        env = with_last_step(env, **config.observation)
+        return env if config.adapter is None else config.adapter(env)
     except ValueError as error:
         raise ConfigError(f"{config.source}: {config.env_id}: {error}") from error
 
