@@ -9,6 +9,8 @@ from io import StringIO
 from typing import Any
 
 import cloudpickle
+import numpy as np
+from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_belief.common.plain_data import NotPlainError
@@ -18,6 +20,7 @@ from sb3_belief.envs.registry import spec
 from sb3_belief.envs.suites import load_attribute
 from sb3_belief.vec_env.copy_state import CopyState
 from sb3_belief.vec_env.observation_forms import ObservationForms
+from sb3_belief.vec_env.own_state import own_state, state_row
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.user_env import UserEnv, check_interface
 from sb3_belief.vec_env.validation import check_spaces
@@ -26,6 +29,7 @@ from sb3_belief.vec_env.validation import check_spaces
 _TRIAL = "sb3_belief.team.trial:try_to_learn"
 # Steps of PettingZoo's own test
 _PETTINGZOO_STEPS = 50
+_STATE_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ def check_team_env(
                 _report_seeding(make_played, played, record, seed, report)
                 _report_play(record, report)
                 _report_state(played, seed, report)
+                _report_global_state(played, seed, report)
             _report_pickling(make, report)
             _report_trial(make, n_steps, seed, report)
     finally:
@@ -273,6 +278,39 @@ def _report_state(env: UserEnv, seed: int, report: Report) -> None:
         report.add("state", "FAIL", f"after set_state() the same actions give something else. Change: {change}.")
     else:
         report.add("state", "ok", "set_state() restores the environment to where get_state() was called")
+
+
+def _report_global_state(env: UserEnv, seed: int, report: Report) -> None:
+    """Check what joint learners are given as the state."""
+    state = own_state(env)
+    if state is None:
+        widths = [spaces.flatdim(env.observation_space(agent)) for agent in env.possible_agents]
+        text = f"no state(): joint learners are given all observations, {sum(widths)} numbers"
+        report.add("global state", "note", text)
+        return
+    player, rows = RandomPlayer(env, seed=0), []
+    try:
+        player.reset(seed)
+        for t in range(_STATE_STEPS):
+            rows.append(state_row(state(), f"after step {t}"))
+            player.step()
+            if not env.agents:
+                # The last state of an episode counts as well: where a limit cut it off, what follows is valued by it
+                rows.append(state_row(state(), f"after step {t + 1}"))
+                player.reset(None)
+        player.reset(seed)
+        again = state_row(state(), "at reset")
+    except Exception as error:
+        change = "state() must return an array of finite numbers at any time after reset()"
+        report.add("global state", "FAIL", f"{_describe_error(error)}. Change: {change}.")
+        return
+    if len({len(row) for row in rows}) > 1:
+        widths = sorted({len(row) for row in rows})
+        report.add("global state", "FAIL", f"it has {widths} entries at different steps. Change: give it one shape.")
+    elif not np.array_equal(again, rows[0]):
+        report.add("global state", "FAIL", "it differs after two resets with one seed. Change: seed all that it shows.")
+    else:
+        report.add("global state", "ok", f"state() gives {len(again)} numbers, for joint learners alone")
 
 
 def _continue_play(player: RandomPlayer) -> list[tuple]:

@@ -193,6 +193,28 @@ _SPECS |= {
     for id, kwargs in _FORAGING.items()
 }
 
+_MATRIX_GAMES = "sb3_belief.envs.matrix_games"
+_SPECS |= {
+    id: EnvSpec(id, f"{_MATRIX_GAMES}:MatrixGame", {"payoffs": payoffs})
+    for id, payoffs in {
+        "climbing": ((11, -30, 0), (-30, 7, 0), (0, 6, 5)),
+        "qtran-matrix": ((8, -12, -12), (-12, 0, 0), (-12, 0, 0)),
+        "qplex-matrix": ((8, -12, -12), (-12, 6, 0), (-12, 0, 6)),
+        "coordination": ((1, 0), (0, 1)),
+    }.items()
+}
+_SPECS |= {
+    id: EnvSpec(id, f"{_MATRIX_GAMES}:{game}")
+    for id, game in {
+        "penalty": "Penalty",
+        "permutation": "Permutation",
+        "two-step": "TwoStep",
+        "cues": "Cues",
+        "hidden-offset": "HiddenOffset",
+        "levers": "Levers",
+    }.items()
+}
+
 
 def register(id: str, kwargs: Mapping[str, Any] | None = None, batched: str | None = None) -> Callable[[Maker], Maker]:
     """

@@ -77,6 +77,18 @@ def mask_row(mask: Any, space: spaces.Space, agent: str, where: str | None = Non
     return row.astype(bool) if flags is None else flags
 
 
+def wrong_width(agent: str, width: int, given: int, where: str) -> ValueError:
+    """
+    Return the error for a mask that does not fit the action space.
+
+    :param agent: Name of the agent
+    :param width: Number of flags that its mask must have
+    :param given: Number that it has
+    :param where: Copy and step, in words
+    """
+    return ValueError(f"The action mask of {agent!r} {where} must have {width} entries, one for each action, got {given}.")
+
+
 def first_actions(space: spaces.Space) -> np.ndarray:
     """
     Return the mask for an agent whose action counts for nothing: a model must choose one, so the first is left.

@@ -106,9 +106,10 @@ class AgentVecEnv(VecEnv):
     ``infos[e]`` holds ``others_actions`` float32 ``[W]`` (the others in order, the scripted ones last: one-hot for Discrete
     and MultiDiscrete, values for Box and MultiBinary; zero where not visible), ``others_visible`` bool ``[n_others]`` and
     ``active`` bool. At a done it also holds ``terminal_observation`` and ``TimeLimit.truncated``, and at the end of the team's
-    episode ``episode`` (with the agent's own return) and ``is_success``. What the environment's own info of the agent holds
-    besides (``infos[agent]["fuel"]``) is there under the same keys. ``get_attr("others_action_spaces")`` returns the
-    spaces of the others, and ``env_method("action_masks")`` the agent's own masks where the environment has masks.
+    episode ``terminal_action_masks`` (the agent's own, bool ``[k]``, in an environment with masks), ``episode`` (with the
+    agent's own return) and ``is_success``. The global state never reaches an agent. What the environment's own info of the
+    agent holds besides (``infos[agent]["fuel"]``) is there under the same keys. ``get_attr("others_action_spaces")`` returns
+    the spaces of the others, and ``env_method("action_masks")`` the agent's own masks where the environment has masks.
 
     :param source: Steps the team
     :param agent: Name of the agent
@@ -297,6 +298,8 @@ class TransitionSplitter:
         """Return what SB3 expects in the info of a done. Where only the agent's own return has ended, nothing is reset."""
         end = {"terminal_observation": info.get("terminal_observation", {}).get(self._agents[i], obs)}
         end["TimeLimit.truncated"] = cut
+        if self._agents[i] in info.get("terminal_action_masks", ()):
+            end["terminal_action_masks"] = info["terminal_action_masks"][self._agents[i]]
         if "episode" in info:
             end["episode"] = {**info["episode"], "r": float(info["agent_episode_rewards"][i])}
             if "is_success" in info:

@@ -12,30 +12,32 @@ from pettingzoo import ParallelEnv
 
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
-from sb3_belief.vec_env.action_masks import mask_row, mask_width
+from sb3_belief.vec_env.action_masks import mask_row, mask_width, wrong_width
 from sb3_belief.vec_env.copy_state import CopyState
 from sb3_belief.vec_env.events import Events, Flags, StepRecord, find_events, no_flags
 from sb3_belief.vec_env.observation_forms import ObservationForms, copied, has_parts, map_parts, zeros_in
 from sb3_belief.vec_env.own_infos import own_infos
+from sb3_belief.vec_env.own_state import own_state, state_row, state_width
 from sb3_belief.vec_env.returned import (
     StepParts,
-    plain_flags,
     plain_infos,
+    plain_parts,
     plain_reset,
-    plain_rewards,
     plain_step,
     plain_team_reward,
 )
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member
 from sb3_belief.vec_env.success import reports_success
 from sb3_belief.vec_env.user_env import UserEnv, separate_agents
-from sb3_belief.vec_env.validation import check_names, check_observation, no_last_observation, place
+from sb3_belief.vec_env.validation import check_names, check_observation, forgotten_agents, no_last_observation, place
 from sb3_belief.vec_env.visible import VisibleOthers
 
 # Says whose action of the last step each agent could observe: bool [n_others] by agent
 Visibility: TypeAlias = Callable[[ParallelEnv], Mapping[str, np.ndarray]]
 # Types of infos, and of the sum of rewards if these are numbers
 _DICT, _NUMBERS = {dict}, {float, int, np.float64, np.float32, np.int64, np.int32}
+#: Under this name the info of a step holds the state after it, and after the reset where an episode has ended
+STATE = "team_state"
 
 
 class JointEnv(gym.Env):
@@ -111,6 +113,9 @@ class JointEnv(gym.Env):
         ]
         self._copy, self._t = copy, 0
         self._copy_state: CopyState | None = None
+        self._state: Any = own_state(env)
+        #: Whether the infos of steps hold the environment's own state
+        self.tells_states = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], dict]:
         """
@@ -175,7 +180,7 @@ class JointEnv(gym.Env):
             any_info = any_end = True
             as_usual = False
             after = self.agents_in_play
-            obs, rewards, terminations, truncations, infos = self._plain(result)
+            obs, rewards, terminations, truncations, infos = plain_parts(result, agents, self._where)
             agent_rewards = [rewards.get(agent, 0.0) for agent in agents]
             total = sum(agent_rewards)
         if not as_usual:
@@ -225,18 +230,6 @@ class JointEnv(gym.Env):
         obs, infos = self._forms.convert(obs, infos, self._where if self._t < 2 else None)
         return obs, rewards, terminations, truncations, infos
 
-    def _plain(self, result: Any) -> StepParts:
-        """Convert what a step returned, or find out what is wrong with it."""
-        obs, rewards, terminations, truncations, infos = plain_step(result, self._where)
-        agents = self.possible_agents
-        return (
-            obs,
-            plain_rewards(rewards, self._where),
-            plain_flags("terminations", terminations, agents, self._where),
-            plain_flags("truncations", truncations, agents, self._where),
-            plain_infos(infos, agents, self._where),
-        )
-
     def _own_team_reward(self, rewards: dict[str, float], total: float) -> float:
         """Return the team's reward as the environment computes it."""
         reward = self._team_reward(rewards)
@@ -278,6 +271,15 @@ class JointEnv(gym.Env):
         assert self._copy_state is not None
         self._copy_state.set(state)
         self._t, self._has_masks, self._said_success = own
+
+    def state_width(self) -> int | None:
+        """Return the number of entries of the environment's own state; None if it has none."""
+        return state_width(self.env, self._state, lambda: self.agents_in_play or self._game.reset(), self._where)
+
+    def tell_state(self) -> np.ndarray:
+        """Return the environment's own state, float32 ``[d_s]``, and let the info of each step hold it from now on."""
+        self.tells_states = True
+        return state_row(self._state(), self._where)
 
     def render(self) -> Any:
         """Return what the environment's own ``render()`` returns."""
@@ -339,14 +341,9 @@ class JointEnv(gym.Env):
         return place(self._copy, self._t)
 
     def _check_possible_agents(self) -> None:
-        """Check that the environment still knows all its agents: if it forgets one, that one never returns."""
         names = getattr(self._game, "possible_agents", None)
         if names is not None and len(names) != len(self.possible_agents):
-            raise ValueError(
-                f"possible_agents of {type(self.env).__name__} were {self.possible_agents} and are {list(names)}"
-                f" {self._where}: they must remain the same. If agents and possible_agents are one list, what is removed from"
-                " the one is gone from the other: begin episodes with self.agents = list(self.possible_agents)."
-            )
+            raise forgotten_agents(type(self.env).__name__, self.possible_agents, list(names), self._where)
 
     def _masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
         """Return ``action_masks`` as in ``StepRecord``, or nothing as long as no info has held a mask."""
@@ -364,10 +361,7 @@ class JointEnv(gym.Env):
                 continue
             mask = mask_row(info["action_mask"], self.action_spaces[agent], agent, where)
             if mask.size != width:
-                raise ValueError(
-                    f"The action mask of {agent!r} {self._where} must have {width} entries, one for each"
-                    f" action, got {mask.size}."
-                )
+                raise wrong_width(agent, width, mask.size, self._where)
             masks.append(mask)
         return {"action_masks": np.concatenate(masks)}
 
@@ -381,7 +375,8 @@ def step_and_reset(
     :param env: The environment
     :param action: Actions by agent
     :return: Observations by agent, team reward, whether an episode has ended, the ``StepRecord``, the masks for the next
-        actions, and what else the infos hold. Where an episode has ended, observations and masks are those of the new one
+        actions, and what else the infos hold. Where an episode has ended, observations and masks are those of the new one, and
+        the infos hold the last masks, those of all agents side by side, under ``terminal_action_masks``
     """
     obs, reward, terminated, truncated, info = env.step(action)
     record: StepRecord = info.pop("joint")
@@ -390,8 +385,14 @@ def step_and_reset(
         info["TimeLimit.truncated"] = truncated and not terminated
         # Copies, since the environment may reuse its arrays at the reset
         info["terminal_observation"] = {agent: copied(last) for agent, last in obs.items()}
+        if masks is not None:
+            info["terminal_action_masks"] = masks
+        if env.tells_states:
+            info["terminal_state"] = env.tell_state()
         obs, reset_info = env.reset()
         masks = reset_info.get("action_masks")
+    if env.tells_states:
+        info[STATE] = env.tell_state()
     return obs, reward, done, record, masks, info
 
 

@@ -20,6 +20,7 @@ RESERVED = CONTRACT | {
     "others_actions",
     "others_visible",
     "scripted_actions",
+    "team_state",
     "terminal_action_masks",
     "terminal_observation",
     "terminal_state",

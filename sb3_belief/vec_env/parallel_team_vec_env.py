@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.action_masks import mask_width
-from sb3_belief.vec_env.joint_env import JointEnv, step_and_reset
+from sb3_belief.vec_env.joint_env import STATE, JointEnv, step_and_reset
 from sb3_belief.vec_env.observation_forms import ObservationStack
 from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step
+from sb3_belief.vec_env.states import ENVIRONMENT, OBSERVATIONS, unbounded
 from sb3_belief.vec_env.step_checks import StepChecks
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 from sb3_belief.vec_env.validation import check_spaces
@@ -47,6 +48,8 @@ class ParallelTeamVecEnv(TeamVecEnv):
     ):
         self.venv: _InProcessVecEnv | WorkersVecEnv
         self._masks: np.ndarray | None = None
+        # The environment's own states; None where they have to be asked for
+        self._states: np.ndarray | None = None
         if subproc:
             self.venv = WorkersVecEnv(env_fns, step_timeout, restart_workers)
         else:
@@ -116,11 +119,44 @@ class ParallelTeamVecEnv(TeamVecEnv):
 
         :return: bool ``[num_envs, k]`` by agent, or None if the environment has no masks
         """
-        if self._masks is None:
-            return None
-        parts = np.split(self._masks, np.cumsum(self._mask_widths)[:-1], axis=1)
+        return None if self._masks is None else self._by_agent(self._masks)
+
+    def _by_agent(self, masks: np.ndarray) -> dict[str, np.ndarray]:
+        parts = np.split(masks, np.cumsum(self._mask_widths)[:-1], axis=1)
         columns = zip(self.possible_agents, parts, self._mask_widths, strict=True)
         return {agent: part for agent, part, width in columns if width}
+
+    @cached_property
+    def _own_state_width(self) -> int | None:
+        return self.venv.env_method("state_width", indices=0)[0]
+
+    @property
+    def state_source(self) -> str:
+        """Where states come from, as in the base class; for an environment without ``state_space`` a copy may be reset."""
+        return OBSERVATIONS if self._own_state_width is None else ENVIRONMENT
+
+    @property
+    def state_space(self) -> spaces.Box:
+        """The space of a state, float32 ``[d_s]``."""
+        return super().state_space if self._own_state_width is None else unbounded(self._own_state_width)
+
+    def states(self) -> np.ndarray:
+        if self._own_state_width is None:
+            return super().states()
+        self._last_observations()
+        self._asked_for_states = True
+        if self._states is None:
+            self._states = self._stack_states(self.venv.env_method("tell_state"))
+        return self._states
+
+    def _stack_states(self, rows: list[np.ndarray]) -> np.ndarray:
+        for copy, row in enumerate(rows):
+            if len(row) != self._own_state_width:
+                raise ValueError(
+                    f"state() of environment copy {copy} has {len(row)} entries, and had {self._own_state_width}: it must have"
+                    " the same shape in all copies and at every step."
+                )
+        return np.stack(rows)
 
     def close(self) -> None:
         """End the workers, or close the copies."""
@@ -152,7 +188,7 @@ class ParallelTeamVecEnv(TeamVecEnv):
     def _reset_joint(self) -> TeamObs:
         obs: Any = self.venv.reset()
         reset_infos = self.venv.reset_infos
-        self._masks, self._checks.unable = None, {}
+        self._masks, self._states, self._checks.unable = None, None, {}
         if "action_masks" in reset_infos[0]:
             self._masks = np.array([info["action_masks"] for info in reset_infos])
             self._checks.check_masks(self._masks, np.zeros(self.num_envs, dtype=int))
@@ -193,10 +229,33 @@ class ParallelTeamVecEnv(TeamVecEnv):
             # A step that broke off tells nothing of who was in play in it
             self._checks.check_unable([{} if "worker_restarted" in info else info for info in infos])
         self._checks.check_finite(obs, self.venv.agent_rewards, self._lengths)
+        if dones.any():
+            self._tell_terminal_masks(dones, infos)
         if self.venv.action_masks is not None:
             self._masks = self.venv.action_masks
             self._checks.check_masks(self._masks, np.where(dones, 0, self._lengths + 1))
         return step
+
+    def _tell_terminal_masks(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Give the last masks of ended episodes by agent; an episode that broke off ends with those of its last step."""
+        for copy in np.flatnonzero(dones):
+            info = infos[copy]
+            if "worker_restarted" in info and self._masks is not None:
+                info["terminal_action_masks"] = self._masks[copy]
+            if "terminal_action_masks" in info:
+                row = self._checks.possible(info["terminal_action_masks"])
+                info["terminal_action_masks"] = {agent: part[0] for agent, part in self._by_agent(row[None]).items()}
+
+    def _tell_terminal_states(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        if self._own_state_width is None:
+            super()._tell_terminal_states(dones, infos)
+            return
+        for copy, info in enumerate(infos):
+            if "worker_restarted" in info and self._states is not None:
+                info["terminal_state"] = self._states[copy]
+        rows = [info.pop(STATE, None) for info in infos]
+        # A copy that was made anew does not know yet that it is to tell its states
+        self._states = None if any(row is None for row in rows) else self._stack_states(rows)
 
 
 class _InProcessVecEnv(DummyVecEnv):

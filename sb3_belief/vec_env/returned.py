@@ -195,3 +195,23 @@ def _described(given: Any) -> str:
     if isinstance(given, (tuple, list)):
         return f"a {type(given).__name__} of {len(given)}"
     return "None" if given is None else f"a {type(given).__name__}"
+
+
+def plain_parts(result: Any, agents: Iterable[str], where: str) -> StepParts:
+    """
+    Convert all that a step returned, or find out what is wrong with it.
+
+    :param result: What ``step`` returned
+    :param agents: Names of the agents
+    :param where: Copy and step, in words
+    :return: Observations, rewards, terminations, truncations and infos, by agent
+    :raises ValueError: If it cannot be converted
+    """
+    obs, rewards, terminations, truncations, infos = plain_step(result, where)
+    return (
+        obs,
+        plain_rewards(rewards, where),
+        plain_flags("terminations", terminations, agents, where),
+        plain_flags("truncations", truncations, agents, where),
+        plain_infos(infos, agents, where),
+    )

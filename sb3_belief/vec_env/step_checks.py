@@ -131,6 +131,23 @@ class StepChecks:
                 masks[copy, self._mask_starts[k]] = True
                 self.unable[copy, self._mask_owners[k]] = int(steps[copy])
 
+    def possible(self, masks: np.ndarray) -> np.ndarray:
+        """
+        Return the masks after the last step of an episode, in which those that allow no action allow the first one.
+
+        Nobody acts on them, so none is an error.
+
+        :param masks: Masks of all agents side by side, bool ``[width of all]``
+        :return: The same, or a copy
+        """
+        if not self._mask_owners:
+            return masks
+        possible = np.logical_or.reduceat(masks, self._mask_starts)
+        if not possible.all():
+            masks = masks.copy()
+            masks[self._mask_starts[~possible]] = True
+        return masks
+
     def check_unable(self, infos: list[dict[str, Any]]) -> None:
         """
         Check that agents whose masks allowed no action were out of play in the step that followed.

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sb3_belief.common.plain_data import NotPlainError
 from sb3_belief.vec_env.monitor_files import monitor_sizes, open_monitor_files
+from sb3_belief.vec_env.states import GlobalStates
 from sb3_belief.vec_env.validation import check_spaces, difference
 
 TeamObs: TypeAlias = dict[str, np.ndarray]
@@ -61,7 +62,7 @@ class JointObs(dict[str, Any]):
         return np.array([info["life_end"][i] or info["truncated"][i] for info in self._infos]) if self._infos else None
 
 
-class TeamVecEnv(VecEnv):
+class TeamVecEnv(GlobalStates, VecEnv):
     """
     Vectorised environment of a team of ``n`` agents: copies that are stepped together and reset automatically.
 
@@ -85,7 +86,9 @@ class TeamVecEnv(VecEnv):
     - what the environment's infos hold under names that are no agents, under these names
 
     Entries of the environment never replace one of the others. At the end of the team's episode it also holds
-    ``terminal_observation`` {agent: obs}, ``TimeLimit.truncated`` bool, ``is_success`` bool (if the environment reports it:
+    ``terminal_observation`` {agent: obs}, ``terminal_action_masks`` {agent: bool ``[k]``} (the masks after the last step, in
+    an environment with masks), ``terminal_state`` float32 ``[d_s]`` (from the first call of :meth:`states` on),
+    ``TimeLimit.truncated`` bool, ``is_success`` bool (if the environment reports it:
     then at every end, False where it says nothing), ``episode`` {"r": team return, "l": length, "t": seconds since the start}
     and ``agent_episode_rewards`` float64 ``[n]``. Where a copy has failed and was made anew, its episode ends so too, with
     rewards of 0 and ``worker_restarted`` True.
@@ -173,7 +176,8 @@ class TeamVecEnv(VecEnv):
         """
         if self.monitor_dir is not None and not self._writers:
             self.start_monitor(self.monitor_dir)
-        obs = JointObs(self._reset_joint(), self.possible_agents)
+        self._obs = self._reset_joint()
+        obs = JointObs(self._obs, self.possible_agents)
         # Seeds and options are used only once
         self._reset_seeds()
         self._reset_options()
@@ -198,6 +202,9 @@ class TeamVecEnv(VecEnv):
         """
         obs, rewards, dones, infos = self._step_joint(self._actions)
         self._monitor_step(rewards, dones, infos)
+        self._obs = obs
+        if self._asked_for_states:
+            self._tell_terminal_states(dones, infos)
         return JointObs(obs, self.possible_agents, infos), rewards, dones, infos
 
     def step(self, actions: TeamObs) -> TeamStep:  # type: ignore[override]
@@ -329,6 +336,8 @@ class TeamVecEnv(VecEnv):
             "returns": (self._team_returns.copy(), self._agent_returns.copy(), self._lengths.copy()),
             "last": (self.last_rewards.copy(), self.last_dones.copy(), self.last_agent_rewards.copy()),
             "reports_success": self.reports_success,
+            # States may consist of them
+            "observations": self._obs if self._asked_for_states else None,
         }
 
     def set_exact_state(self, state: dict[str, Any]) -> None:
@@ -342,6 +351,7 @@ class TeamVecEnv(VecEnv):
         self._team_returns, self._agent_returns, self._lengths = state["returns"]
         self.last_rewards, self.last_dones, self.last_agent_rewards = state["last"]
         self.reports_success = state["reports_success"]
+        self._obs = state.get("observations") or self._obs
 
     def _copies_state(self) -> Any:
         """Return what decides how the copies go on, as plain data."""

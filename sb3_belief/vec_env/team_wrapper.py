@@ -60,6 +60,19 @@ class TeamVecEnvWrapper(TeamVecEnv):
     def begin_rollout(self) -> None:
         self.venv.begin_rollout()
 
+    @property
+    def state_source(self) -> str:
+        """Where the states of the environment within come from."""
+        return self.venv.state_source
+
+    @property
+    def state_space(self) -> spaces.Box:
+        """The space of the states of the environment within."""
+        return self.venv.state_space
+
+    def states(self) -> np.ndarray:
+        return self.venv.states()
+
     def action_masks(self) -> dict[str, np.ndarray] | None:
         masks = self.venv.action_masks()
         return None if masks is None else {agent: masks[agent] for agent in self.possible_agents if agent in masks}

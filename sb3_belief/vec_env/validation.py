@@ -237,6 +237,22 @@ def no_last_observation(agent: str, where: str) -> ValueError:
     )
 
 
+def forgotten_agents(env: str, were: Sequence[str], are: Sequence[Any], where: str) -> ValueError:
+    """
+    Return the error for an environment that no longer knows all its agents: one that it forgets never returns.
+
+    :param env: Its class
+    :param were: Its agents as they were when it was made
+    :param are: Its agents now
+    :param where: Copy and step, in words
+    """
+    return ValueError(
+        f"possible_agents of {env} were {list(were)} and are {list(are)} {where}: they must remain the same. If agents and"
+        " possible_agents are one list, what is removed from the one is gone from the other: begin episodes with self.agents ="
+        " list(self.possible_agents)."
+    )
+
+
 def not_finite(what: str, values: np.ndarray, where: str) -> ValueError:
     """
     Return the error for a number that is not finite.

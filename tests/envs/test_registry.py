@@ -34,7 +34,9 @@ def test_all_ids_make_what_they_say():
     aisles = ["aisle-sides", "aisle-sides-kinds"]
     cultures = ["junction-cultures-easy", "junction-cultures-medium", "junction-cultures-orders"]
     tasks = ["convention-episode", "foreign-speaker", "picker", "lbf-heuristics"]
-    assert registered_ids() == levels + games + aisles + cultures + tasks
+    tables = ["climbing", "qtran-matrix", "qplex-matrix", "coordination"]
+    small = ["penalty", "permutation", "two-step", "cues", "hidden-offset", "levers"]
+    assert registered_ids() == levels + games + aisles + cultures + tasks + tables + small
     for env_id in games:
         # The arguments behind the ids are tested with the environment
         env, batched = make_parallel_env(env_id), make_batched_env(env_id, 3)

@@ -51,6 +51,7 @@ class StarCraft(BattleGame[np.ndarray]):
         info = self.game.get_env_info()
         n_agents = info["n_agents"]
         self.n_actions, self.width = int(info["n_actions"]), int(info["obs_shape"]) + extra_width
+        self.state_width = int(info["state_shape"])
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
         self.agents: list[str] = []
         self.observation_spaces: dict[str, spaces.Space] = {
@@ -162,6 +163,19 @@ class StarCraft(BattleGame[np.ndarray]):
             dict.fromkeys(self.possible_agents, bool(ended) and truncated),
             infos,
         )
+
+    @property
+    def state_space(self) -> spaces.Box:
+        """The space of :meth:`state`."""
+        return spaces.Box(-np.inf, np.inf, (self.state_width,), dtype=np.float32)
+
+    def state(self) -> np.ndarray:
+        """
+        Return the package's state of the battle, which knows all units. After a lost connection it is that of the next battle.
+
+        :return: float32 [width]
+        """
+        return np.array(self.game.get_state(), dtype=np.float32)
 
     def visibility(self) -> dict[str, np.ndarray]:
         """

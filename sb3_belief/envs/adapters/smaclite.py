@@ -34,6 +34,14 @@ class Battle(GymTupleEnv):
     stay in ``agents`` until then and are inactive: they observe zeros, have only the action 0 and still get the team's reward.
     """
 
+    def state(self) -> np.ndarray:
+        """
+        Return the package's state of the battle, which knows all units.
+
+        :return: float32 [width]
+        """
+        return np.array(self.game.get_state(), dtype=np.float32)
+
     def _visible(self, observations: Sequence[np.ndarray]) -> np.ndarray:
         """Return the teammates that the observation shows. Each has a block of its own, which begins with 1 if it is seen."""
         first = 4 + self.game.n_enemies * self.game.enemy_feat_size

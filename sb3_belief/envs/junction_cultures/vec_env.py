@@ -95,7 +95,9 @@ class JunctionCulturesVecEnv(BatchedVecEnv):
         obs = self.core.observe()
         ended = np.flatnonzero(result.dones)
         if len(ended):
+            masks = self.action_masks()[LEARNER]
             for copy in ended:
+                infos[copy]["terminal_action_masks"] = {LEARNER: masks[copy]}
                 infos[copy]["is_success"] = bool(self.core.traffic.n_collisions[copy] == 0)
                 infos[copy]["TimeLimit.truncated"] = bool(infos[copy]["truncated"][0])
                 infos[copy]["terminal_observation"] = {LEARNER: obs[copy]}

@@ -72,7 +72,9 @@ class TrafficJunctionVecEnv(BatchedVecEnv):
         self._show()
         ended = np.flatnonzero(result.dones)
         if len(ended):
+            masks = self.action_masks()
             for copy in ended:
+                infos[copy]["terminal_action_masks"] = {agent: rows[copy] for agent, rows in masks.items()}
                 infos[copy]["is_success"] = bool(self.core.n_collisions[copy] == 0)
                 infos[copy]["TimeLimit.truncated"] = True
                 infos[copy]["terminal_observation"] = {agent: values[copy] for agent, values in obs.items()}

@@ -74,6 +74,10 @@ class FakeSMAClite(gym.Env):
         ended = not self.enemies or not self.agents
         return self._get_obs(), reward, ended, False, {"battle_won": not self.enemies}
 
+    def get_state(self):
+        own = [self.agents[i].pos if i in self.agents else 0.0 for i in range(self.n_agents)]
+        return np.array(own + [self.enemies[k].pos if k in self.enemies else 0.0 for k in range(self.n_enemies)])
+
     def get_avail_actions(self):
         rows = []
         for i in range(self.n_agents):

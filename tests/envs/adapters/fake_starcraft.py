@@ -319,7 +319,10 @@ class StarCraft2Env:
         return [self.get_obs_agent(i) for i in range(self.n_agents)]
 
     def get_state(self):
-        return np.zeros(self.get_state_size(), dtype=np.float32)
+        state = np.zeros(self.get_state_size(), dtype=np.float32)
+        units = [*self.agents.values(), *self.enemies.values()]
+        state[: len(units)] = [unit.health / unit.health_max for unit in units]
+        return state
 
     def get_state_size(self):
         return 4 * self.n_agents + 3 * self.n_enemies

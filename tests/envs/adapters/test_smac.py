@@ -333,3 +333,22 @@ def test_a_team_learns_is_saved_and_evaluated(faults, tmp_path, env_id):
     # Without masks the agents choose actions that the game refuses
     with pytest.raises(ValueError, match="heeds action masks"):
         Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=64).learn(128)
+
+
+@pytest.mark.parametrize("maker", [MAKERS[1], MAKERS[3]])
+def test_the_state_and_the_last_masks(faults, maker):
+    env = make_team_env(maker, seed=0)
+    assert env.state_source == "env"
+    env.reset()
+    rng, done, units = np.random.default_rng(0), False, 0
+    while not done:
+        (own,) = env.get_attr("game")
+        state = env.states()[0]
+        assert state in env.state_space and np.array_equal(state, own.get_state())
+        actions = {agent: (rng.random(mask.shape) * mask).argmax(axis=1) for agent, mask in env.action_masks().items()}
+        _, _, (done,), (info,) = env.step(actions)
+        units = max(units, int((state > 0).sum()))
+    # One side is dead, and whoever lost units is known by its masks
+    assert 0 < (info["terminal_state"] > 0).sum() < units
+    dead = [mask[0] for mask in info["terminal_action_masks"].values()]
+    assert dead == (info["terminal_state"][: len(dead)] == 0).tolist()

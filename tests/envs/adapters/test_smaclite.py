@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-from sb3_belief import MaskableBeliefPPO
+from sb3_belief import MaskableBeliefPPO, make_team_env
 from sb3_belief.envs.adapters import smaclite
 from tests.envs.adapters.fake_smaclite import SIGHT, USED, FakeSMAClite
 from tests.envs.adapters.tuple_helpers import make_team, train_save_load_evaluate
@@ -46,6 +46,15 @@ def in_sight(env):
         for i in range(n)
     ]
     return [row[:i] + row[i + 1 :] for i, row in enumerate(near)]
+
+
+@pytest.mark.parametrize("make", [fake, real])
+def test_the_state(make):
+    env: Any = make_team_env(make, seed=0)
+    assert env.state_source == "env"
+    env.reset()
+    (game,) = env.get_attr("game")
+    assert np.array_equal(env.states()[0], np.float32(game.get_state())) and env.states()[0].any()
 
 
 @pytest.mark.parametrize("make", [fake, real, partial(real, "3s5z")])

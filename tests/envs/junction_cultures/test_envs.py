@@ -20,7 +20,7 @@ VARIANTS: list[dict[str, Any]] = [
 # What an agent's own info may hold
 TOLD = {
     *("others_actions", "others_visible", "active", "terminal_observation", "episode", "TimeLimit.truncated"),
-    *("is_success", "action_mask"),
+    *("is_success", "action_mask", "terminal_action_masks"),
 }
 
 
@@ -95,8 +95,10 @@ def test_a_batch_equals_the_general_vectoriser_and_nobody_is_told():
         np.testing.assert_array_equal(steps[0][1], steps[1][1])
         for info, info2 in zip(steps[0][3], steps[1][3], strict=True):
             assert info.keys() | {"TimeLimit.truncated"} == info2.keys() | {"TimeLimit.truncated"}
-            for key in info2.keys() - {"episode", "terminal_observation"}:
+            for key in info2.keys() - {"episode", "terminal_observation", "terminal_action_masks"}:
                 np.testing.assert_array_equal(info.get(key, False), info2[key], err_msg=key)
+            last = [each["terminal_action_masks"]["car_0"].tolist() for each in (info, info2) if "episode" in each]
+            assert last[:1] == last[1:]
             assert "agent_infos" not in info and "partner" in info
         for loop, step in zip(loops, steps, strict=True):
             (transition,) = loop._splitter.split(actions, step)

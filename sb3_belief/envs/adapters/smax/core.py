@@ -46,6 +46,7 @@ class Battles:
         self._program = battle_program(config)
         self.agents, self.stop = self._program.agents, self._program.stop
         self.n_actions, self.width, self.drawing = self._program.n_actions, self._program.width, self._program.drawing
+        self.state_width = self._program.state_width
         self._keys: Any = np.random.SeedSequence().generate_state(2 * n_copies).reshape(n_copies, 2)
         self._states: Any = None
         # Before the first reset only "stop" is possible
@@ -117,6 +118,14 @@ class Battles:
         # Copies, because arrays from jax are read-only, which PyTorch does not support
         self.observations, self.masks = np.array(view.observations), np.array(view.masks)
         self._alive = np.array(view.alive)
+
+    def world_states(self) -> np.ndarray:
+        """
+        Return what is known of all units of each copy, as SMAX has it.
+
+        :return: float32 [n, ``state_width``]
+        """
+        return np.array(self._program.world_states(self._states), dtype=np.float32)
 
     def units(self, copy: int) -> dict[str, np.ndarray]:
         """

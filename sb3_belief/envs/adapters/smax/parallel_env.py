@@ -104,6 +104,19 @@ class Smax(BattleGame[np.ndarray]):
             infos,
         )
 
+    @property
+    def state_space(self) -> spaces.Box:
+        """The space of :meth:`state`."""
+        return spaces.Box(-np.inf, np.inf, (self.battles.state_width,), dtype=np.float32)
+
+    def state(self) -> np.ndarray:
+        """
+        Return SMAX's world state: what is known of all units, allies and enemies.
+
+        :return: float32 [width]
+        """
+        return self.battles.world_states()[0]
+
     def visibility(self) -> dict[str, np.ndarray]:
         """
         Return whose action of the last step each agent could observe.

@@ -129,6 +129,7 @@ class BattleProgram:
       ``BattleView`` and a ``BattleOutcome``.
     - ``choose(ended bool [n], new, old)`` returns the new keys and states of battles that have ended and the old ones of the
       others.
+    - ``world_states(states)`` returns SMAX's world state of each copy, float32 [n, ``state_width``]: all units.
 
     :param config: The rules
     """
@@ -203,6 +204,9 @@ class BattleProgram:
         self.advance = jax.jit(jax.vmap(advance_one, out_axes=(0, 0, by_agent, 0)))
         # Starting battles in all copies and choosing afterwards needs only one compiled version of begin
         self.choose = jax.jit(choose)
+        # Not part of the view: who has no joint learner never compiles it
+        self.world_states = jax.jit(jax.vmap(env.get_world_state))
+        self.state_width = int(env.state_size)
         self._jax = jax
 
     @cached_property

@@ -11,6 +11,7 @@ from sb3_belief.envs.adapters.smax.parallel_env import RENDER_MODES, observation
 from sb3_belief.envs.adapters.smax.program import BattleConfig
 from sb3_belief.envs.adapters.smax.rendering import draw, unit_positions
 from sb3_belief.envs.base import check_render_mode
+from sb3_belief.vec_env.states import ENVIRONMENT, unbounded
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep, TeamVecEnv
 
 
@@ -87,7 +88,12 @@ class SmaxVecEnv(TeamVecEnv):
         obs = self._observe()
         ended = np.flatnonzero(result.ended)
         if len(ended):
+            masks = self.action_masks()
+            states = self.battles.world_states() if self._asked_for_states else None
             for copy in ended:
+                if states is not None:
+                    infos[copy]["terminal_state"] = states[copy]
+                infos[copy]["terminal_action_masks"] = {agent: rows[copy] for agent, rows in masks.items()}
                 infos[copy]["is_success"] = bool(result.won[copy])
                 infos[copy]["TimeLimit.truncated"] = bool(result.cut[copy])
                 infos[copy]["terminal_observation"] = {agent: values[copy] for agent, values in obs.items()}
@@ -112,6 +118,29 @@ class SmaxVecEnv(TeamVecEnv):
         :return: {agent: bool [num_envs, k]}. Dead agents may only stop
         """
         return dict(zip(self.possible_agents, self.battles.masks, strict=True))
+
+    @property
+    def state_source(self) -> str:
+        """``"env"``: states are SMAX's own."""
+        return ENVIRONMENT
+
+    @property
+    def state_space(self) -> spaces.Box:
+        """The space of a state."""
+        return unbounded(self.battles.state_width)
+
+    def states(self) -> np.ndarray:
+        """
+        Return SMAX's world states, as :meth:`Smax.state` does.
+
+        :return: float32 [num_envs, width]
+        """
+        self._last_observations()
+        self._asked_for_states = True
+        return self.battles.world_states()
+
+    def _tell_terminal_states(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Do nothing: a step does it, before it begins the next battle."""
 
     def get_state(self) -> list[dict[str, Any]]:
         """

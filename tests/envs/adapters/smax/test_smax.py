@@ -286,3 +286,24 @@ def test_workers():
             np.testing.assert_array_equal(values[0], expected[agent])
     finally:
         env.close()
+
+
+def test_states_and_last_masks_of_a_batch_equal_those_of_single_copies():
+    mixed, general = make_batched("3m", 2), make_team_env(partial(make, "3m"), n_envs=2)
+    for env in (mixed, general):
+        env.seed(7)
+        env.reset()
+    assert mixed.state_source == general.state_source == "env" and mixed.state_space == general.state_space
+    generator, ended = np.random.default_rng(0), 0
+    for _ in range(80):
+        assert mixed.states().shape == (2, mixed.state_space.shape[0])
+        np.testing.assert_allclose(mixed.states(), general.states(), atol=1e-5)
+        actions = masked_choice(mixed.action_masks(), generator)
+        (_, _, dones, infos), (_, _, _, others) = mixed.step(actions), general.step(actions)
+        for copy in np.flatnonzero(dones):
+            ended += 1
+            last, same = infos[copy], others[copy]
+            np.testing.assert_allclose(last["terminal_state"], same["terminal_state"], atol=1e-5)
+            for agent, mask in last["terminal_action_masks"].items():
+                assert mask.tolist() == same["terminal_action_masks"][agent].tolist()
+    assert ended
