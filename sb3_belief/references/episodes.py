@@ -60,6 +60,8 @@ class EpisodeReplayBuffer(ReplayBuffer):
     ):
         # Not ReplayBuffer's: it allocates arrays of single steps
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
+        # What SB3 looks for when it loads one; limits are told from ends here
+        self.handle_timeout_termination = True
         self.episodes: list[dict[str, np.ndarray]] = []
         # The steps of the episodes under way; None until one begins
         self._open: list[list[dict[str, Any]] | None] = [None] * n_envs
