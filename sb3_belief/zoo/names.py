@@ -89,6 +89,15 @@ def _import(path: str) -> Any:
 SHARED = "shares weights: not decentralised"
 _NO_BELIEF: Mapping[str, Any] = MappingProxyType({"belief": "none"})
 _SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
+#: What is said of references that learn centrally
+CENTRAL = "uses the global state in training"
+_JOINT = "sb3_belief.references.joint_vec_env:joint_team"
+
+
+def _factorised(mixer: str) -> Algo:
+    path = "sb3_belief.references.factorisation:ValueFactorisation"
+    return Algo(path, MappingProxyType({"mixer": mixer}), adapter=_JOINT, note=CENTRAL)
+
 
 
 #: The algorithms whose unmodified ``learn()`` runs in a team. ARS is not among them, because it steps its environments itself
@@ -114,6 +123,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "qrdqn": Algo("sb3_contrib:QRDQN"),
         "tqc": Algo("sb3_contrib:TQC"),
         "crossq": Algo("sb3_contrib:CrossQ"),
+        **{mixer: _factorised(mixer) for mixer in ("vdn", "qmix", "qplex", "qtran")},
     }
 )
 
