@@ -14,7 +14,7 @@ from sb3_belief.common.checks import check_integer, check_share
 from sb3_belief.references.agent_net import AgentValues
 from sb3_belief.references.episodes import EpisodeBatch, EpisodeReplayBuffer, lambda_returns
 from sb3_belief.references.factorised_policy import MIXERS, FactorisedPolicy
-from sb3_belief.references.joint_vec_env import check_joint_env
+from sb3_belief.references.joint_vec_env import check_joint_env, refuse_normalisation
 
 
 class ValueFactorisation(OffPolicyAlgorithm):
@@ -234,11 +234,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
     # SB3's protocol
 
     def _setup_model(self) -> None:
-        if self.env is not None and self._vec_normalize_env is not None:
-            raise ValueError(
-                f"{type(self).__name__} does not take normalised observations, since masks and states are among them: leave"
-                " normalize out."
-            )
+        refuse_normalisation(self)
         super()._setup_model()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

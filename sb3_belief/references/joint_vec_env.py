@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -174,6 +175,20 @@ def check_joint_env(env: GymEnv | str, actions: type[spaces.Space], learner: str
     if not isinstance(joint, actions):
         needed, found = ("Discrete", "Box") if actions is spaces.MultiDiscrete else ("Box", "Discrete")
         raise ValueError(f"{learner} needs agents with {needed} actions, and those of this environment are {found}: {joint}.")
+
+
+def refuse_normalisation(model: BaseAlgorithm) -> None:
+    """
+    Check that a joint learner is not given normalised observations.
+
+    :param model: The learner
+    :raises ValueError: If its environment normalises
+    """
+    if model.get_vec_normalize_env() is not None:
+        raise ValueError(
+            f"{type(model).__name__} does not take normalised observations, since masks and states are among them: leave"
+            " normalize out."
+        )
 
 
 def _bounds(boxes: list[Any]) -> tuple[list[np.ndarray], list[np.ndarray]]:

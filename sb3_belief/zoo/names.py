@@ -99,7 +99,6 @@ def _factorised(mixer: str) -> Algo:
     return Algo(path, MappingProxyType({"mixer": mixer}), adapter=_JOINT, note=CENTRAL)
 
 
-
 #: The algorithms whose unmodified ``learn()`` runs in a team. ARS is not among them, because it steps its environments itself
 ALGOS: Mapping[str, Algo] = MappingProxyType(
     {
@@ -123,6 +122,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "qrdqn": Algo("sb3_contrib:QRDQN"),
         "tqc": Algo("sb3_contrib:TQC"),
         "crossq": Algo("sb3_contrib:CrossQ"),
+        "coma": Algo("sb3_belief.references.coma:COMA", adapter=_JOINT, note=CENTRAL),
         **{mixer: _factorised(mixer) for mixer in ("vdn", "qmix", "qplex", "qtran")},
     }
 )
