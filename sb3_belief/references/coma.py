@@ -4,7 +4,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -72,7 +71,7 @@ class COMA(OnPolicyAlgorithm):
         if ent_coef < 0:
             raise ValueError(f"ent_coef={ent_coef!r} must be at least 0: the weight of the entropy.")
         if env is not None:
-            check_joint_env(env, spaces.MultiDiscrete, "coma")
+            check_joint_env(env, "coma")
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,  # type: ignore[arg-type]
@@ -160,7 +159,7 @@ class COMA(OnPolicyAlgorithm):
         return loss.item()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, spaces.MultiDiscrete, "coma")
+        check_joint_env(env, "coma")
         super().set_env(env, force_reset)
 
     def learn(

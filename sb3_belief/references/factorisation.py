@@ -4,7 +4,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -92,7 +91,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         check_share("exploration_initial_eps", exploration_initial_eps, "the probability of a random action")
         check_share("exploration_final_eps", exploration_final_eps, "the probability of a random action")
         if env is not None:
-            check_joint_env(env, spaces.MultiDiscrete, f"mixer={mixer!r}")
+            check_joint_env(env, f"mixer={mixer!r}")
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -238,7 +237,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         super()._setup_model()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, spaces.MultiDiscrete, f"mixer={self.mixer!r}")
+        check_joint_env(env, f"mixer={self.mixer!r}")
         super().set_env(env, force_reset)
 
     def learn(

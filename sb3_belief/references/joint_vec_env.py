@@ -30,9 +30,11 @@ class JointVecEnv(VecEnvWrapper):
     - ``mask`` ``[n, U]``, for Discrete actions: which are legal; the last are not for an agent with fewer. Where the
       environment leaves none, as it may to an agent out of play, it is the first
 
-    Actions are MultiDiscrete, one for each agent, or a Box of the agents' Box actions one after the other. The reward is the
-    team's, the end that of its episode. The info has what that of the ``TeamVecEnv`` has, ``terminal_observation`` in the form
-    above, and ``in_play`` bool ``[n]``: whether an agent was in play when it acted.
+    Actions are MultiDiscrete, one for each agent, or a Box ``[n, W]`` of the agents' Box actions, each as a row that is filled
+    up to the widest one by numbers in [-1, 1] that count for nothing. The reward is the team's, the end that of its episode.
+    The info has what that of the ``TeamVecEnv`` has, ``terminal_observation`` in the form above, and, for each agent ``[n]``,
+    ``in_play`` bool (whether it was when it acted), ``own_rewards`` float32 and ``own_ends`` bool (whether its own return
+    ended, rather than being cut off by a limit).
 
     :param venv: The environment of the team
     :raises TypeError: If it is none
@@ -70,8 +72,11 @@ class JointVecEnv(VecEnvWrapper):
             parts["mask"] = spaces.MultiBinary([n, self.n_actions])
             joint: spaces.Space = spaces.MultiDiscrete(sizes)
         elif all(isinstance(space, spaces.Box) for space in self._acted):
-            low, high = (np.concatenate([np.ravel(bound) for bound in bounds]) for bounds in _bounds(self._acted))
-            joint = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+            sizes = [int(np.prod(space.shape)) for space in self._acted]
+            low, high = (np.full((n, max(sizes)), bound, dtype=np.float32) for bound in (-1, 1))
+            for i, (space, size) in enumerate(zip(self._acted, sizes, strict=True)):
+                low[i, :size], high[i, :size] = space.low.ravel(), space.high.ravel()
+            joint = spaces.Box(low, high, dtype=np.float32)
         else:
             kinds = {agent: str(acted[agent]) for agent in self._agents}
             raise ValueError(f"Joint learners take agents' actions that are all Discrete, or all Box, not {kinds}.")
@@ -83,22 +88,23 @@ class JointVecEnv(VecEnvWrapper):
         return self._joint(obs, self.venv.states(), active, self.venv.action_masks())
 
     def step_async(self, actions: np.ndarray) -> None:
-        if self.n_actions:
-            columns = list(actions.T)
-        else:
-            sizes = [int(np.prod(space.shape or ())) for space in self._acted]
-            columns = np.split(actions, np.cumsum(sizes)[:-1], axis=1)
         self.venv.step_async(
             {
-                agent: column.reshape(-1, *(space.shape or ())).astype(space.dtype)
-                for agent, column, space in zip(self._agents, columns, self._acted, strict=True)
+                agent: self._own_actions(actions[:, i], space)
+                for i, (agent, space) in enumerate(zip(self._agents, self._acted, strict=True))
             }
         )
+
+    @staticmethod
+    def _own_actions(rows: np.ndarray, space: Any) -> np.ndarray:
+        if isinstance(space, spaces.Discrete):
+            return rows
+        return rows[:, : int(np.prod(space.shape))].reshape(-1, *space.shape).astype(space.dtype)
 
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         active = np.stack([self._active(info) for info in infos])
-        shown = [{**info, "in_play": info["active"]} for info in infos]
+        shown = [{**info, **self._of_each(info, bool(done))} for info, done in zip(infos, dones, strict=True)]
         for copy in np.flatnonzero(dones):
             info = infos[copy]
             last = {agent: map_parts(_one_row, own) for agent, own in info["terminal_observation"].items()}
@@ -131,6 +137,13 @@ class JointVecEnv(VecEnvWrapper):
             return [None if masks is None else masks[i] for i in self._get_indices(indices)]
         return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
+    @staticmethod
+    def _of_each(info: dict[str, Any], done: bool) -> dict[str, np.ndarray]:
+        """Return what an info says of each agent, under names of its own: the others are read by a team's own environment."""
+        ended = done and not info["TimeLimit.truncated"]
+        ends = np.ones_like(info["life_end"]) if ended else info["life_end"]
+        return {"in_play": info["active"], "own_rewards": info["agent_rewards"], "own_ends": ends}
+
     def _active(self, info: dict[str, Any]) -> np.ndarray:
         """Return who is in play after a step: as the environment says, otherwise who was and whose return goes on."""
         said = info.get("agent_infos", {})
@@ -156,13 +169,15 @@ class JointVecEnv(VecEnvWrapper):
         return joint
 
 
-def check_joint_env(env: GymEnv | str, actions: type[spaces.Space], learner: str) -> None:
+def check_joint_env(
+    env: GymEnv | str, learner: str, actions: tuple[type[spaces.Space], ...] = (spaces.MultiDiscrete,)
+) -> None:
     """
     Check that a joint learner can learn in an environment.
 
     :param env: What the user gave
-    :param actions: The kind of joint actions that the learner chooses
     :param learner: What it is called
+    :param actions: The kinds of joint actions that the learner chooses
     :raises ValueError: If it cannot, with what it needs
     """
     observed = getattr(env, "observation_space", None)
@@ -173,8 +188,7 @@ def check_joint_env(env: GymEnv | str, actions: type[spaces.Space], learner: str
         )
     joint = getattr(env, "action_space", None)
     if not isinstance(joint, actions):
-        needed, found = ("Discrete", "Box") if actions is spaces.MultiDiscrete else ("Box", "Discrete")
-        raise ValueError(f"{learner} needs agents with {needed} actions, and those of this environment are {found}: {joint}.")
+        raise ValueError(f"{learner} needs agents with Discrete actions, and those of this environment are Box: {joint}.")
 
 
 def refuse_normalisation(model: BaseAlgorithm) -> None:
@@ -189,10 +203,6 @@ def refuse_normalisation(model: BaseAlgorithm) -> None:
             f"{type(model).__name__} does not take normalised observations, since masks and states are among them: leave"
             " normalize out."
         )
-
-
-def _bounds(boxes: list[Any]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return [box.low for box in boxes], [box.high for box in boxes]
 
 
 def _one_row(part: Any) -> np.ndarray:

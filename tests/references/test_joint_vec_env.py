@@ -94,11 +94,11 @@ class BoxTeam(CountingTeam):
         return super().step({"a": 0})
 
 
-def test_box_actions_lie_one_after_the_other():
+def test_box_actions_are_rows():
     env = JointVecEnv(make_team_env(BoxTeam, n_envs=1))
-    assert env.action_space.low.tolist() == [-1, -1, 0] and env.action_space.high.tolist() == [2, 2, 5]
+    assert env.action_space.low.tolist() == [[-1, -1], [0, -1]] and env.action_space.high.tolist() == [[2, 2], [5, 1]]
     assert "mask" not in env.reset()
-    env.step(np.array([[0.5, 1.5, 4.5]], dtype=np.float32))
+    env.step(np.array([[[0.5, 1.5], [4.5, 0.0]]], dtype=np.float32))
     seen = env.get_attr("seen")[0]
     assert seen["a"].tolist() == [[0.5], [1.5]] and seen["b"].tolist() == [4.5]
 
@@ -131,11 +131,12 @@ def test_only_of_a_team():
 
 
 def test_who_can_learn_in_it():
-    check_joint_env(joint_env(), spaces.MultiDiscrete, "qmix")
+    check_joint_env(joint_env(), "qmix")
+    check_joint_env(JointVecEnv(make_team_env(BoxTeam, n_envs=1)), "maddpg", (spaces.MultiDiscrete, spaces.Box))
     with pytest.raises(ValueError, match="qmix needs agents with Discrete actions, and those of this environment are Box"):
-        check_joint_env(JointVecEnv(make_team_env(BoxTeam, n_envs=1)), spaces.MultiDiscrete, "qmix")
+        check_joint_env(JointVecEnv(make_team_env(BoxTeam, n_envs=1)), "qmix")
     with pytest.raises(ValueError, match="shown as one"):
-        check_joint_env(make_team_env(CountingTeam, n_envs=1), spaces.MultiDiscrete, "qmix")
+        check_joint_env(make_team_env(CountingTeam, n_envs=1), "qmix")
 
 
 def test_a_model_of_sb3_learns_in_it():
