@@ -64,16 +64,26 @@ class AgentNet(nn.Module):
     :param hidden_dim: Width ``h``, at least 1
     :param recurrent: Whether the second layer is a GRU, which remembers the episode
     :param share: Whether the agents share all weights and are told apart by a one-hot id; otherwise each has its own
+    :param n_outputs: Width of the last layer; None for a value of each action
     """
 
     def __init__(
-        self, n_agents: int, obs_dim: int, n_actions: int, hidden_dim: int = 64, recurrent: bool = True, share: bool = True
+        self,
+        n_agents: int,
+        obs_dim: int,
+        n_actions: int,
+        hidden_dim: int = 64,
+        recurrent: bool = True,
+        share: bool = True,
+        n_outputs: int | None = None,
     ):
         super().__init__()
         self.n_agents, self.n_actions, self.hidden_dim, self.share = n_agents, n_actions, hidden_dim, share
         width = obs_dim + n_actions + (n_agents if share else 0)
         # With shared weights all agents are rows of one network
-        self.nets = nn.ModuleList(_Net(width, hidden_dim, n_actions, recurrent) for _ in range(1 if share else n_agents))
+        self.nets = nn.ModuleList(
+            _Net(width, hidden_dim, n_outputs or n_actions, recurrent) for _ in range(1 if share else n_agents)
+        )
 
     def initial_hidden(self, n_rows: int) -> th.Tensor:
         """
@@ -91,8 +101,8 @@ class AgentNet(nn.Module):
         :param obs: Observations ``[B, T, n, d]``
         :param last_actions: One-hot actions of the steps before, zero at an episode's first step, ``[B, T, n, U]``
         :param hidden: Hidden states before the first of these steps, ``[B, n, h]``
-        :return: Values ``[B, T, n, U]``, of legal and other actions alike; features of the last layer ``[B, T, n, h]``; hidden
-            states after the last step ``[B, n, h]``
+        :return: Values ``[B, T, n, U]``, of legal and other actions alike, or what else the last layer says; features of that
+            layer ``[B, T, n, h]``; hidden states after the last step ``[B, n, h]``
         """
         rows = th.cat([obs, last_actions], dim=-1)
         if self.share:
@@ -109,13 +119,13 @@ class AgentNet(nn.Module):
 class _Net(nn.Module):
     """One network, which all agents may be rows of."""
 
-    def __init__(self, width: int, hidden_dim: int, n_actions: int, recurrent: bool):
+    def __init__(self, width: int, hidden_dim: int, n_outputs: int, recurrent: bool):
         super().__init__()
         self.first = nn.Linear(width, hidden_dim)
         self.second: nn.Module = (
             nn.GRU(hidden_dim, hidden_dim, batch_first=True) if recurrent else nn.Linear(hidden_dim, hidden_dim)
         )
-        self.last = nn.Linear(hidden_dim, n_actions)
+        self.last = nn.Linear(hidden_dim, n_outputs)
 
     def forward(self, rows: th.Tensor, hidden: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Pass rows ``[B, n, T, width]`` with hidden states ``[B, n, h]``."""

@@ -71,7 +71,7 @@ class COMA(OnPolicyAlgorithm):
         if ent_coef < 0:
             raise ValueError(f"ent_coef={ent_coef!r} must be at least 0: the weight of the entropy.")
         if env is not None:
-            check_joint_env(env, "coma")
+            check_joint_env(env, type(self).__name__)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,  # type: ignore[arg-type]
@@ -159,7 +159,7 @@ class COMA(OnPolicyAlgorithm):
         return loss.item()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, "coma")
+        check_joint_env(env, type(self).__name__)
         super().set_env(env, force_reset)
 
     def learn(

@@ -161,7 +161,12 @@ class EpisodeReplayBuffer(ReplayBuffer):
 
 
 def lambda_returns(
-    rewards: th.Tensor, ends: th.Tensor, exists: th.Tensor, next_values: th.Tensor, gamma: float, td_lambda: float
+    rewards: th.Tensor,
+    ends: th.Tensor,
+    exists: th.Tensor,
+    next_values: th.Tensor,
+    gamma: float,
+    td_lambda: float | th.Tensor,
 ) -> th.Tensor:
     """
     Return TD(lambda) targets, started at each episode's own last step.
@@ -174,15 +179,16 @@ def lambda_returns(
     :param exists: Whether the episode has this step, ``[B, T]``
     :param next_values: Value of the observation after this step, ``[B, T]``
     :param gamma: Discount factor, in [0, 1]
-    :param td_lambda: In [0, 1]
+    :param td_lambda: In [0, 1]; a number, or one for each step ``[T]``
     :return: ``[B, T]``; where no step exists, any number
     """
     follows = th.cat([exists[:, 1:], th.zeros_like(exists[:, :1])], dim=1)
     is_last = exists > follows
     returns = th.zeros_like(rewards)
+    lambdas = th.as_tensor(td_lambda, dtype=rewards.dtype, device=rewards.device).expand(rewards.shape[1])
     after = next_values[:, -1]
     for t in reversed(range(rewards.shape[1])):
         after = th.where(is_last[:, t], next_values[:, t], after)
-        mixed = (1 - td_lambda) * next_values[:, t] + td_lambda * after
+        mixed = (1 - lambdas[t]) * next_values[:, t] + lambdas[t] * after
         after = returns[:, t] = rewards[:, t] + gamma * (1 - ends[:, t]) * mixed
     return returns

@@ -91,7 +91,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         check_share("exploration_initial_eps", exploration_initial_eps, "the probability of a random action")
         check_share("exploration_final_eps", exploration_final_eps, "the probability of a random action")
         if env is not None:
-            check_joint_env(env, f"mixer={mixer!r}")
+            check_joint_env(env, type(self).__name__)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -237,7 +237,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         super()._setup_model()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, f"mixer={self.mixer!r}")
+        check_joint_env(env, type(self).__name__)
         super().set_env(env, force_reset)
 
     def learn(

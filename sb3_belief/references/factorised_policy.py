@@ -21,6 +21,22 @@ MIXERS: dict[str, type[Mixer] | type[QTRAN]] = {"vdn": VDN, "qmix": QMIX, "qplex
 ActingState = tuple[np.ndarray, ...]
 
 
+def explore(chosen: np.ndarray, mask: np.ndarray, epsilon: float) -> np.ndarray:
+    """
+    Replace choices by random ones, by a coin for each.
+
+    :param chosen: int ``[n_envs, n]``
+    :param mask: What may be chosen, bool ``[n_envs, n, U]``
+    :param epsilon: Probability of a random choice, in [0, 1]
+    :return: int ``[n_envs, n]``
+    """
+    if epsilon == 0:
+        return chosen
+    # Of the uniform numbers of what is legal the largest is that of any of it with the same probability
+    anything = np.where(mask, np.random.rand(*mask.shape), -1.0).argmax(axis=-1)
+    return np.where(np.random.rand(*chosen.shape) < epsilon, anything, chosen)
+
+
 class FactorisedValue(nn.Module):
     """
     The agents' networks and the mixer of their values.
@@ -81,18 +97,28 @@ class FactorisedPolicy(BasePolicy):
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True}
         super().__init__(observation_space, action_space, optimizer_class=optimizer_class, optimizer_kwargs=optimizer_kwargs)
-        self.arguments = dict(mixer=mixer, mixer_kwargs=mixer_kwargs, hidden_dim=hidden_dim, recurrent=recurrent, share=share)
+        self.arguments: dict[str, Any] = dict(
+            mixer=mixer, mixer_kwargs=mixer_kwargs, hidden_dim=hidden_dim, recurrent=recurrent, share=share
+        )
         sizes: Any = {key: space.shape for key, space in observation_space.spaces.items()}
-        (n_agents, n_actions), (_, obs_dim), (state_dim,) = sizes["mask"], sizes["obs"], sizes["state"]
-        agents = AgentNet(n_agents, obs_dim, n_actions, hidden_dim, recurrent, share)
-        kwargs = {**({"features_dim": hidden_dim} if mixer == "qtran" else {}), **(mixer_kwargs or {})}
-        self.net = FactorisedValue(agents, MIXERS[mixer](n_agents, n_actions, state_dim, **kwargs))
-        self.target_net = deepcopy(self.net).requires_grad_(False)
+        self.n_agents, self.n_actions = sizes["mask"]
+        self.obs_dim, self.state_dim = sizes["obs"][1], sizes["state"][0]
+        self.net: Any = self._make_net()
+        self.target_net: Any = deepcopy(self.net).requires_grad_(False)
         self.optimizer = self.optimizer_class(
             self.net.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
+
+    def _make_net(self) -> nn.Module:
+        """Return the networks that are trained, and copied into the target."""
+        mixer, hidden_dim = self.arguments["mixer"], self.arguments["hidden_dim"]
+        agents = AgentNet(
+            self.n_agents, self.obs_dim, self.n_actions, hidden_dim, self.arguments["recurrent"], self.arguments["share"]
+        )
+        kwargs = {**({"features_dim": hidden_dim} if mixer == "qtran" else {}), **(self.arguments["mixer_kwargs"] or {})}
+        return FactorisedValue(agents, MIXERS[mixer](self.n_agents, self.n_actions, self.state_dim, **kwargs))
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -125,11 +151,8 @@ class FactorisedPolicy(BasePolicy):
         obs, is_batch = self.obs_to_tensor(observation)
         with th.no_grad():
             values, hidden = self._step_values(obs, state, episode_start)
-        actions, mask = values.greedy().cpu().numpy(), values.q.isfinite().cpu().numpy()
-        if epsilon > 0:
-            # Of the uniform numbers of the legal actions the largest is that of any of them with the same probability
-            anything = np.where(mask, np.random.rand(*mask.shape), -1.0).argmax(axis=-1)
-            actions = np.where(np.random.rand(*actions.shape) < epsilon, anything, actions)
+        mask = values.q.isfinite().cpu().numpy()
+        actions = explore(values.greedy().cpu().numpy(), mask, epsilon)
         last_actions = np.eye(mask.shape[-1], dtype=np.float32)[actions]
         return actions if is_batch else actions[0], (hidden.cpu().numpy(), last_actions)
 

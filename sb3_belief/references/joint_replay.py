@@ -37,19 +37,21 @@ class JointReplayBuffer(DictReplayBuffer):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        n_agents = self.observation_space["active"].shape[0]
-        shape = (self.buffer_size, self.n_envs, n_agents)
+        agents: Any = self.observation_space["active"]
+        shape = (self.buffer_size, self.n_envs, *agents.shape)
         #: The agents' own rewards, ends and whether they were in play, float32 ``[buffer_size, n_envs, n]``
         self.own_rewards, self.own_ends, self.in_play = (np.zeros(shape, dtype=np.float32) for _ in range(3))
 
-    def add(  # type: ignore[override]
+    def add(
         self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         for array, key in ((self.own_rewards, "own_rewards"), (self.own_ends, "own_ends"), (self.in_play, "in_play")):
             array[self.pos] = [info[key] for info in infos]
         super().add(obs, next_obs, action, reward, done, infos)
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> JointSamples:  # type: ignore[override]
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> JointSamples:
         at = batch_inds, np.random.randint(self.n_envs, size=len(batch_inds))
         obs, next_obs = (
             {key: self.to_torch(part[at]) for key, part in parts.items()}

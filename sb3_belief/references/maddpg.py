@@ -87,7 +87,7 @@ class MADDPG(OffPolicyAlgorithm):
             if value < 0:
                 raise ValueError(f"{name}={value!r} must be at least 0.")
         if env is not None:
-            check_joint_env(env, "maddpg", _ACTIONS)
+            check_joint_env(env, type(self).__name__, _ACTIONS)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -202,7 +202,7 @@ class MADDPG(OffPolicyAlgorithm):
         optimizer.step()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, "maddpg", _ACTIONS)
+        check_joint_env(env, type(self).__name__, _ACTIONS)
         super().set_env(env, force_reset)
 
     def learn(

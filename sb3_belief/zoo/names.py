@@ -122,6 +122,7 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "qrdqn": Algo("sb3_contrib:QRDQN"),
         "tqc": Algo("sb3_contrib:TQC"),
         "crossq": Algo("sb3_contrib:CrossQ"),
+        "rode": Algo("sb3_belief.references.rode:RODE", adapter=_JOINT, note=CENTRAL),
         "maddpg": Algo("sb3_belief.references.maddpg:MADDPG", adapter=_JOINT, note=CENTRAL),
         "coma": Algo("sb3_belief.references.coma:COMA", adapter=_JOINT, note=CENTRAL),
         **{mixer: _factorised(mixer) for mixer in ("vdn", "qmix", "qplex", "qtran")},

@@ -15,7 +15,7 @@ from tests.references.counting_team import CountingTeam
 from tests.team.exact.test_exact import SaveOnce
 from tests.team.helpers import Team, make_team_env
 
-NAMES = ("vdn", "qmix", "qplex", "qtran", "coma", "maddpg")
+NAMES = ("vdn", "qmix", "qplex", "qtran", "coma", "maddpg", "rode")
 
 
 @pytest.mark.parametrize("name", NAMES)
