@@ -7,16 +7,15 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, fields
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_belief.belief import n_selected
@@ -26,6 +25,7 @@ from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, read_others
 from sb3_belief.belief_ppo.diagnostics import measure_belief
 from sb3_belief.belief_ppo.extractor import fitting_extractor, rollout_rows
 from sb3_belief.belief_ppo.memory import holds_images, warn_of_memory
+from sb3_belief.belief_ppo.on_policy_details import DetailsAlgorithmMixin
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
@@ -34,13 +34,8 @@ from sb3_belief.common.safe_files.trust import Trust
 
 SelfBelief = TypeVar("SelfBelief", bound="BeliefAlgorithmMixin")
 
-if TYPE_CHECKING:
-    _Algorithm = OnPolicyAlgorithm
-else:
-    _Algorithm = object
 
-
-class BeliefAlgorithmMixin(_Algorithm):
+class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
     """
     Makes an SB3 algorithm of PPO's kind one with a belief.
 
@@ -57,7 +52,6 @@ class BeliefAlgorithmMixin(_Algorithm):
 
     policy: BeliefPolicyMixin
     rollout_buffer: BeliefBufferMixin
-    normalize_advantage: bool
     others_action_spaces: ActionSpaces
     belief: str
     history_length: int
@@ -134,7 +128,13 @@ class BeliefAlgorithmMixin(_Algorithm):
                 **self.policy_kwargs,
                 "others_action_spaces": self.others_action_spaces,
                 **asdict(self._options),
+                "value_norm": self.value_norm,
             }
+        elif not self._value_options.is_of_sb3:
+            raise ValueError(
+                f"value_norm, huber_delta and value_clip need a policy derived from {self.policy_base.__name__}, not"
+                f" {self.policy_class.__name__}"
+            )
         self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, **self._buffer_widths()}
         try:
             super()._setup_model()
@@ -246,23 +246,14 @@ class BeliefAlgorithmMixin(_Algorithm):
     # -- rollout -------------------------------------------------------------------------------------------------------
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        # SB3 calls this once a step, after the callbacks and before it bootstraps time limits and adds the step to the buffer
         super()._update_info_buffer(infos, dones)
-        # SB3 accepts environments that return fewer infos than copies
-        active, next_active = np.ones((2, self.n_envs), dtype=bool)
-        active[: len(infos)] = [info.get("active", True) for info in infos]
-        # An environment that does not say who plays next is taken to go on as it is
-        next_active[: len(infos)] = [info.get("next_active", info.get("active", True)) for info in infos]
-        if dones is not None and dones.any():
-            for copy in np.flatnonzero(dones[: len(infos)] & ~next_active[: len(infos)]):
-                # The critic has no opinion of an agent that is out of play at the limit
-                infos[copy]["TimeLimit.truncated"] = False
-            if isinstance(self.policy, self.policy_base):
-                self.policy.attach_terminal_values(infos, dones)
-        others = read_others(infos, self.policy.layout) if self._has_belief else ()
-        self.rollout_buffer.stage(active, next_active, *others)
-        if others and not active.all():
-            self.rollout_buffer.watch(np.asarray(self._last_episode_starts), np.asarray(self.policy.layout.owners))
+        if dones is not None and dones.any() and isinstance(self.policy, self.policy_base):
+            self.policy.attach_terminal_values(infos, dones)
+        if self._has_belief:
+            buffer, layout = self.rollout_buffer, self.policy.layout
+            buffer.stage_others(*read_others(infos, layout))
+            if not buffer.active[buffer.pos].all():
+                buffer.watch(np.asarray(self._last_episode_starts), np.asarray(layout.owners))
 
     # -- update --------------------------------------------------------------------------------------------------------
 
@@ -274,11 +265,8 @@ class BeliefAlgorithmMixin(_Algorithm):
         update look back on it. It never holds the rows being trained on, where attention would find their own labels.
         """
         buffer, policy = self.rollout_buffer, self.policy
-        # The advantages of a single step cannot be normalised
-        learns = buffer.active.sum() > 1 or (buffer.active.all() and not self.normalize_advantage)
         if not self._has_belief or not buffer.active.any():
-            if learns:
-                self._update()
+            super().train()
             return
         extractor = policy.features_extractor
         if isinstance(extractor, AdaptiveExtractor):
@@ -289,8 +277,7 @@ class BeliefAlgorithmMixin(_Algorithm):
         for name, value in measure_belief(policy, buffer).items():
             self.logger.record(f"belief/{name}", value)
         policy.action_coef, policy.kl_coef = self._coefficient("action_coef"), self._coefficient("kl_coef")
-        if learns:
-            self._update()
+        super().train()
         if isinstance(extractor, AdaptiveExtractor):
             if self.belief_replay:
                 # Drawn as SB3 draws minibatches
@@ -356,12 +343,6 @@ class BeliefAlgorithmMixin(_Algorithm):
             )
         self.logger.record(f"train/{name}", value)
         return value
-
-    def _update(self) -> None:
-        super().train()
-        # SB3 computes it over all steps, including those in which the agent was not in play and no value is trained
-        active, values, returns = (getattr(self.rollout_buffer, name).flatten() for name in ("active", "values", "returns"))
-        self.logger.record("train/explained_variance", explained_variance(values[active], returns[active]))
 
 
 def refuse_many_agents(env: Any, algorithm: str) -> None:

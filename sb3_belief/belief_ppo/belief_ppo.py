@@ -19,6 +19,7 @@ from sb3_belief.belief_ppo.policies import (
     BeliefMlpPolicy,
     BeliefMultiInputPolicy,
 )
+from sb3_belief.belief_ppo.value_loss import ValueOptions
 
 
 class BeliefPPO(BeliefAlgorithmMixin, PPO):
@@ -83,6 +84,13 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param history_dropout: Of ``"adaptive"``: share of the steps in training at which it sees nothing of its memory, in [0, 1)
     :param belief_replay: Of ``"adaptive"``: on how many past rollouts its predictions are trained as well, at least 0, so that
         its weights do not learn the present teammates by heart
+    :param value_norm: Whether the value is predicted in units of the returns' running mean and deviation, as in MAPPO
+        (:class:`~sb3_belief.belief_ppo.value_loss.NormalizedValue`)
+    :param huber_delta: Where the loss of the values turns from quadratic to linear (MAPPO: 10), above 0, in deviations with
+        ``value_norm``; None for SB3's squared error. It is half as large as that where it is quadratic
+    :param value_clip: How far a value may move from what it was while acting until only moving back lowers its loss (MAPPO:
+        0.2), above 0, in deviations with ``value_norm``; None for any distance
+    :param active_masks: Whether steps with ``active=False`` are left out; False trains on them as SB3 does
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -140,6 +148,10 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
         belief_replay: int = 0,
+        value_norm: bool = False,
+        huber_delta: float | None = None,
+        value_clip: float | None = None,
+        active_masks: bool = True,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -184,6 +196,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
             history_dropout=history_dropout,
             belief_replay=belief_replay,
         )
+        self._setup_details(ValueOptions(value_norm, huber_delta, value_clip), active_masks)
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()

@@ -1,23 +1,24 @@
 """
-Rollout buffers that also hold what a belief is trained on, and leave out the steps in which the agent was not in play.
+Rollout buffers that also hold what a belief is trained on.
 
-The belief's data reaches SB3's methods as an argument, although SB3 knows nothing of it: :func:`attach` puts it on an object
-that SB3 only passes on. In a rollout these are the values, from the policy to ``RolloutBuffer.add``; in an update the
-observations of a minibatch, from ``RolloutBuffer.get`` to ``evaluate_actions``. What the environment says of a step comes by
-way of ``_update_info_buffer``, which SB3 calls once a step just before ``add``: see :meth:`BeliefBufferMixin.stage`.
+The belief's data reaches SB3's methods as an argument, although SB3 knows nothing of it:
+:func:`attach` puts it on an object that SB3 only passes on. In a rollout these are the values,
+from the policy to ``RolloutBuffer.add``; in an update the observations of a minibatch, from ``RolloutBuffer.get`` to
+``evaluate_actions``. What the environment says of a step comes by way of ``_update_info_buffer``, which SB3 calls once a step
+just before ``add``: see :meth:`BeliefBufferMixin.stage_others`.
 """
 
-from collections.abc import Generator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief import ActionLayout
-from sb3_belief.belief_ppo.cut_returns import CutReturns
+from sb3_belief.belief_ppo.active_steps import ActiveStepsBufferMixin
+from sb3_belief.belief_ppo.value_loss import ValueTargets
 
 Carrier = TypeVar("Carrier")
 
@@ -123,22 +124,17 @@ def _rows(key: str, width: int, infos: Sequence[Mapping[str, Any]]) -> np.ndarra
     return np.concatenate(rows).reshape(len(rows), width)
 
 
-if TYPE_CHECKING:
-    _Buffer = RolloutBuffer
-else:
-    _Buffer = object
-
 # The places of rewards and values among the arguments of add()
 _REWARD, _VALUE = 2, 4
-_EXTRAS = (
-    *("noise", "selected", "others_actions", "others_visible", "active"),
+_OF_BELIEF = (
+    *("noise", "selected", "others_actions", "others_visible"),
     *("stamps", "own_rewards", "attended_actions", "attended_visible"),
 )
 
 
-class BeliefBufferMixin(_Buffer):
+class BeliefBufferMixin(ActiveStepsBufferMixin):
     """
-    Makes a rollout buffer of SB3's one with a belief's data.
+    Makes a rollout buffer of SB3's one with a belief's data, which leaves out inactive steps.
 
     :param noise_dim: ``z``, 0 where no belief is sampled
     :param max_selected: The most history rows that are attended to, ``N_h``, 0 where none are
@@ -151,7 +147,8 @@ class BeliefBufferMixin(_Buffer):
     selected: np.ndarray
     others_actions: np.ndarray
     others_visible: np.ndarray
-    active: np.ndarray
+
+    extras = (*ActiveStepsBufferMixin.extras, *_OF_BELIEF)
 
     def __init__(
         self,
@@ -171,7 +168,6 @@ class BeliefBufferMixin(_Buffer):
         #: What the belief is trained on besides, of the past rollouts
         self.replay: list[dict[str, np.ndarray]] = []
         super().__init__(*args, **kwargs)
-        self._cut_returns = CutReturns(self.n_envs, self.gamma)
 
     def reset(self) -> None:
         super().reset()
@@ -180,7 +176,6 @@ class BeliefBufferMixin(_Buffer):
         self.selected = np.zeros((*rows, self._widths["selected"]), dtype=np.int32)
         self.others_actions = np.zeros((*rows, self._widths["others_actions"]), dtype=np.float32)
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
-        self.active = np.ones(rows, dtype=bool)
         self.stamps = np.zeros((*rows, 3 if self._is_online else 0), dtype=np.int64)
         self.own_rewards = np.zeros(rows if self._is_online else (*rows, 0), dtype=np.float32)
         # As they are attended to within the rollout: what is seen of others while the agent waits comes into a row later on
@@ -188,31 +183,18 @@ class BeliefBufferMixin(_Buffer):
         self.attended_visible = np.zeros((*rows, self._widths["others_visible"] if self._is_online else 0), dtype=bool)
         #: What the rewards of the step that is added next have been raised by, which the agent has not got
         self.bootstraps = np.zeros(self.n_envs, dtype=np.float32)
-        # Whether it is in play at the observation after the last step
-        self._next_active = np.ones(self.n_envs, dtype=bool)
         # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
         self._n_selected = 0
 
-    def stage(
-        self,
-        active: np.ndarray,
-        next_active: np.ndarray | None = None,
-        others_actions: np.ndarray | None = None,
-        others_visible: np.ndarray | None = None,
-    ) -> None:
+    def stage_others(self, others_actions: np.ndarray, others_visible: np.ndarray) -> None:
         """
-        Write what the environment says of a step into the row that ``add`` fills next.
+        Write what the agent has seen of the others in a step into the row that ``add`` fills next.
 
-        :param active: Whether the agent was in play when it acted, bool ``[n_envs]``
-        :param next_active: Whether it is in play after the step, bool ``[n_envs]``; None if that is as in the step
-        :param others_actions: float32 ``[n_envs, W]``, zero where not visible; None without a belief
-        :param others_visible: bool ``[n_envs, n_others]``; None without a belief
+        :param others_actions: float32 ``[n_envs, W]``, zero where not visible
+        :param others_visible: bool ``[n_envs, n_others]``
         """
-        self.active[self.pos] = active
-        self._next_active[:] = active if next_active is None else next_active
-        if others_actions is not None and others_visible is not None:
-            self.others_actions[self.pos] = others_actions
-            self.others_visible[self.pos] = others_visible
+        self.others_actions[self.pos] = others_actions
+        self.others_visible[self.pos] = others_visible
 
     def watch(self, starts: np.ndarray, owners: np.ndarray) -> None:
         """
@@ -269,36 +251,6 @@ class BeliefBufferMixin(_Buffer):
             self.stamps[self.pos] = stamps
         return stamps
 
-    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
-        """
-        Compute returns as SB3 does, except that the critic has no opinion of inactive steps, on which it is never trained.
-
-        The value of an inactive step is what it went on to earn. If the rollout ends while the agent is out of play, this is
-        not known, and :class:`~sb3_belief.belief_ppo.cut_returns.CutReturns` estimates the return of its last active step.
-
-        :param last_values: Values of the observations after the last step, ``[n_envs]``
-        :param dones: Whether the agent's return ended with the last step, ``[n_envs]``
-        """
-        dones = np.asarray(dones, dtype=bool)
-        starts = self.episode_starts.astype(bool)
-        away = ~dones & ~self._next_active
-        if self.active.all() and not away.any():
-            self._cut_returns.forget()
-            return super().compute_returns_and_advantage(last_values, dones)
-        ends = np.concatenate([starts[1:], dones[None]])
-        steps, copies, expected = self._cut_returns.estimate(self.rewards, self.values, self.active, starts, ends, away)
-        next_values = last_values.clone().cpu().numpy().flatten()
-        for step in reversed(range(self.buffer_size)):
-            earned = self.rewards[step] + self.gamma * ~ends[step] * next_values
-            self.values[step] = np.where(self.active[step], self.values[step], earned)
-            next_values = self.values[step]
-        # As if the agent had been paid the expected return there, at the end of an episode
-        rewards, self.rewards = self.rewards, self.rewards.copy()
-        self.rewards[steps, copies], ends[steps, copies] = expected, True
-        self.episode_starts[1:] = ends[:-1]
-        super().compute_returns_and_advantage(last_values, ends[-1])
-        self.rewards, self.episode_starts[1:] = rewards, starts[1:]
-
     def recent(self, n_rows: int) -> tuple[np.ndarray | dict[str, np.ndarray], np.ndarray]:
         """
         Return the last active steps of all copies, interleaved by time.
@@ -318,57 +270,8 @@ class BeliefBufferMixin(_Buffer):
             return {key: pick(part, space[key].shape or ()) for key, part in observations.items()}, actions
         return pick(observations, space.shape or ()), actions
 
-    def active_steps(self) -> np.ndarray:
-        """
-        Return the numbers of the active steps, counted through all copies at each time.
-
-        :return: int ``[N]``, ascending: step t of copy e has the number ``t * n_envs + e``
-        """
-        numbers = np.arange(self.buffer_size * self.n_envs)
-        return numbers[self.active[self.rows_of(numbers)]]
-
-    def rows_of(self, steps: np.ndarray) -> tuple[np.ndarray, ...]:
-        """
-        Return where steps lie in the arrays at present. The first :meth:`get` after a rollout, which may be a callback's, puts
-        the copies one after the other.
-
-        :param steps: Numbers of steps, see :meth:`active_steps`
-        :return: Index into the first one or two dimensions of the arrays
-        """
-        times, copies = np.divmod(steps, self.n_envs)
-        return (copies * self.buffer_size + times,) if self.generator_ready else (times, copies)
-
-    def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
-        """
-        Yield minibatches as SB3 does, without any inactive step and with a :class:`BeliefMinibatch` attached to the
-        observations.
-
-        :param batch_size: Rows of a minibatch, before inactive steps are left out of it; None for all at once
-        :return: The minibatches. If less than two rows are left of one, they go with the next: a single row has no advantage
-            statistics (sb3-contrib would divide by nothing)
-        """
-        if not self.generator_ready:
-            for name in _EXTRAS:
-                array = getattr(self, name)
-                setattr(self, name, array.swapaxes(0, 1).reshape(self.active.size, *array.shape[2:]))
-        leaves_out = not self.active.all()
-        left_over = np.zeros(0, dtype=int)
-        indices: Generator[Any, None, None] = super().get(batch_size)
-        for rows in indices:
-            if leaves_out:
-                rows = np.concatenate([left_over, rows[self.active[rows]]])
-                left_over = rows[:0]
-                if len(rows) < 2:
-                    left_over = rows
-                    continue
-            yield self._samples(rows)
-
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
-        # SB3's get() shuffles and cuts; which rows of a minibatch are used is decided in ours
-        return batch_inds
-
     def _samples(self, rows: np.ndarray) -> Any:
-        samples = super()._get_samples(rows)
+        samples = super()._samples(rows)
         if self._widths["others_visible"] == 0:
             return samples
         return samples._replace(observations=attach(samples.observations, self.belief_minibatch(rows)))
@@ -387,9 +290,24 @@ class BeliefBufferMixin(_Buffer):
         return BeliefMinibatch(*(self.to_torch(part, copy=False) for part in parts))
 
 
-class BeliefRolloutBuffer(BeliefBufferMixin, RolloutBuffer):
+class DetailsBufferMixin(ActiveStepsBufferMixin):
+    """Lets a rollout buffer attach to the observations of a minibatch what its values are trained on."""
+
+    #: Whether it does
+    shows_targets = False
+
+    def _samples(self, rows: np.ndarray) -> Any:
+        samples = super()._samples(rows)
+        if not self.shows_targets:
+            return samples
+        observations: Any = attach(samples.observations, attached(samples.observations))
+        observations.value_targets = ValueTargets(samples.returns, samples.old_values)
+        return samples._replace(observations=observations)
+
+
+class BeliefRolloutBuffer(DetailsBufferMixin, BeliefBufferMixin, RolloutBuffer):
     """SB3's rollout buffer with the belief's part of each step, see :class:`BeliefBufferMixin`."""
 
 
-class BeliefDictRolloutBuffer(BeliefBufferMixin, DictRolloutBuffer):
+class BeliefDictRolloutBuffer(DetailsBufferMixin, BeliefBufferMixin, DictRolloutBuffer):
     """SB3's rollout buffer for Dict observations with the belief's part of each step, see :class:`BeliefBufferMixin`."""

@@ -14,21 +14,23 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_belief.belief import ROW_FEATURES
 from sb3_belief.belief_ppo.algorithm import BeliefAlgorithmMixin, refuse_many_agents
-from sb3_belief.belief_ppo.buffers import BeliefBufferMixin
+from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, DetailsBufferMixin
+from sb3_belief.belief_ppo.on_policy_details import DetailsPolicyMixin
 from sb3_belief.belief_ppo.options import BeliefOptions
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+from sb3_belief.belief_ppo.value_loss import ValueOptions
 
 
-class MaskableBeliefRolloutBuffer(BeliefBufferMixin, MaskableRolloutBuffer):
+class MaskableBeliefRolloutBuffer(DetailsBufferMixin, BeliefBufferMixin, MaskableRolloutBuffer):
     """sb3-contrib's rollout buffer with the belief's data of each step, see :class:`BeliefBufferMixin`."""
 
 
-class MaskableBeliefDictRolloutBuffer(BeliefBufferMixin, MaskableDictRolloutBuffer):
+class MaskableBeliefDictRolloutBuffer(DetailsBufferMixin, BeliefBufferMixin, MaskableDictRolloutBuffer):
     """sb3-contrib's rollout buffer for Dict observations with the belief's data of each step."""
 
 
 # For a type checker the mixins derive from SB3's own classes, from which sb3-contrib's differ in some attributes
-class MaskableBeliefActorCriticPolicy(BeliefPolicyMixin, MaskableActorCriticPolicy):  # type: ignore[misc]
+class MaskableBeliefActorCriticPolicy(DetailsPolicyMixin, BeliefPolicyMixin, MaskableActorCriticPolicy):  # type: ignore[misc]
     """
     sb3-contrib's ``MaskableActorCriticPolicy`` with a belief; takes all of its arguments and those of
     :class:`BeliefPolicyMixin`. Its features extractor is the one that fits the observation space.
@@ -101,6 +103,10 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
     :param row_features: As in BeliefPPO
     :param history_dropout: As in BeliefPPO
     :param belief_replay: As in BeliefPPO
+    :param value_norm: As in BeliefPPO
+    :param huber_delta: As in BeliefPPO
+    :param value_clip: As in BeliefPPO
+    :param active_masks: As in BeliefPPO
     :raises TypeError: For an environment of many agents, with the ways to train on it
     :raises ValueError: For an argument that makes no sense, with what is allowed
     """
@@ -156,6 +162,10 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
         belief_replay: int = 0,
+        value_norm: bool = False,
+        huber_delta: float | None = None,
+        value_clip: float | None = None,
+        active_masks: bool = True,
     ) -> None:
         refuse_many_agents(env, type(self).__name__)
         super().__init__(
@@ -198,6 +208,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
             history_dropout=history_dropout,
             belief_replay=belief_replay,
         )
+        self._setup_details(ValueOptions(value_norm, huber_delta, value_clip), active_masks)
         self._setup_belief(options, action_coef, kl_coef, is_new=_init_setup_model)
         if _init_setup_model:
             self._setup_model()

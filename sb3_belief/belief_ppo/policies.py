@@ -15,8 +15,10 @@ from torch.distributions import Distribution
 
 from sb3_belief.belief import ACTION_LOSSES, BeliefOutput, expected_actions, kl_divergence
 from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor, OnlineMemory
+from sb3_belief.belief_ppo.added_loss import add_loss as add_loss
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch, SampledLatents, attach, attached
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefPass
+from sb3_belief.belief_ppo.on_policy_details import DetailsPolicyMixin
 from sb3_belief.belief_ppo.others import OthersPrediction
 from sb3_belief.belief_ppo.remembering import RememberingMixin
 
@@ -49,35 +51,6 @@ class _Unchecked:
 
     def __exit__(self, *_: object) -> None:
         Distribution.set_default_validate_args(self._before)
-
-
-class _AddLoss(th.autograd.Function):
-    """The identity on ``values``, whose backward pass also hands ``loss`` a gradient of one."""
-
-    @staticmethod
-    def forward(ctx: Any, values: th.Tensor, loss: th.Tensor) -> th.Tensor:
-        return values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        (grad_values,) = grad_outputs
-        return grad_values, grad_values.new_ones(())
-
-
-def add_loss(values: th.Tensor, loss: th.Tensor) -> th.Tensor:
-    """
-    Let ``loss`` be minimised together with whatever is computed from ``values``.
-
-    SB3's PPO asks the policy for the values of a minibatch, builds its own loss from them, and calls ``backward()`` once on
-    it. That pass goes through the values exactly once, whatever the value coefficient; there the loss joins with the weight
-    one. The gradient equals that of the explicit sum ``loss_of_PPO + loss``, and SB3's own gradient clipping, schedules and
-    early stopping apply to it. So ``train()`` need not be copied, and cannot drift from SB3's.
-
-    :param values: Values as the policy returns them, in the graph that is differentiated
-    :param loss: A scalar
-    :return: The same values
-    """
-    return _AddLoss.apply(values, loss)
 
 
 class BeliefPolicyMixin(RememberingMixin):
@@ -310,7 +283,7 @@ class BeliefPolicyMixin(RememberingMixin):
         )
 
 
-class BeliefActorCriticPolicy(BeliefPolicyMixin, ActorCriticPolicy):
+class BeliefActorCriticPolicy(DetailsPolicyMixin, BeliefPolicyMixin, ActorCriticPolicy):
     """
     SB3's ``ActorCriticPolicy`` with a belief; takes all of its arguments and those of :class:`BeliefPolicyMixin`. Its features
     extractor is the one that SB3's own policies have for the observation space: for vectors, images (at least 36x36), Dicts.

@@ -10,12 +10,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_belief.references.one_learner import OneLearnerVecEnv
+from sb3_belief.references.with_state import WithAgentId, WithState, one_row
 from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
+from sb3_belief.vec_env.observation_forms import map_parts, row_of
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamVecEnv
-
-#: Entry of a Dict observation that says whose it is, one-hot
-AGENT_ID = "agent_id"
 
 
 def shared_weights(env: TeamVecEnv, agent_id: bool = True) -> OneLearnerVecEnv:
@@ -27,7 +26,24 @@ def shared_weights(env: TeamVecEnv, agent_id: bool = True) -> OneLearnerVecEnv:
     :return: The environment of the one learner
     :raises ValueError: If the agents' spaces differ, or an observation has no place for the id
     """
-    return OneLearnerVecEnv(env, StackedVecEnv(env, agent_id))
+    _equal_spaces(env)
+    env = WithAgentId(env) if agent_id else env
+    return OneLearnerVecEnv(env, StackedVecEnv(env))
+
+
+def shared_with_state(env: TeamVecEnv, state: str = "any", agent_id: bool = True) -> OneLearnerVecEnv:
+    """
+    Show a team to one model with the same weights for each agent, whose critic sees the global state.
+
+    :param env: Environment of agents with equal spaces
+    :param state: As for :class:`WithState`
+    :param agent_id: Whether the actor, too, sees whose an observation is
+    :return: The environment of the one learner
+    :raises ValueError: As for :class:`WithState` and :func:`shared_weights`
+    """
+    _equal_spaces(env)
+    env = WithState(WithAgentId(env) if agent_id else env, state)
+    return OneLearnerVecEnv(env, StackedVecEnv(env))
 
 
 class StackedVecEnv(VecEnv):
@@ -39,18 +55,14 @@ class StackedVecEnv(VecEnv):
     observations, ``[n, ...]``.
 
     :param venv: Environment of agents with equal spaces
-    :param agent_id: Whether a one-hot id of the agent is appended to each observation: at its end, for a Dict as the entry
-        ``"agent_id"``
-    :raises ValueError: If the agents' spaces differ, or an observation has no place for the id
+    :raises ValueError: If the agents' spaces differ
     """
 
-    def __init__(self, venv: TeamVecEnv, agent_id: bool = False):
-        self.venv, self._agents, self._agent_id = venv, venv.possible_agents, agent_id
-        seen, done = (_equal_spaces(getattr(venv, f"{kind}_space"), self._agents, kind) for kind in ("observation", "action"))
+    def __init__(self, venv: TeamVecEnv):
+        self.venv, self._agents = venv, venv.possible_agents
+        seen, done = _equal_spaces(venv)
         self._mask_width = mask_width(done)
         n = len(self._agents)
-        if agent_id:
-            seen = _with_id(seen, n)
         self._splitter = TransitionSplitter(
             self._agents,
             dict(venv.action_space.spaces),  # type: ignore[attr-defined]
@@ -82,10 +94,10 @@ class StackedVecEnv(VecEnv):
             if own_dones[copy].any():
                 # Of those who are not done the present one, which nobody asks for
                 last = {
-                    agent: _one_row(each.get("terminal_observation", _row(obs[agent], copy)))
+                    agent: map_parts(one_row, each.get("terminal_observation", row_of(obs[agent], copy)))
                     for agent, each in zip(self._agents, own, strict=True)
                 }
-                rows["last"] = said["terminal_observation"] = _row(self._stack(last), 0)
+                rows["last"] = said["terminal_observation"] = row_of(self._stack(last), 0)
             result.append(said)
         return shown, rewards, dones, result
 
@@ -102,16 +114,10 @@ class StackedVecEnv(VecEnv):
         return np.concatenate([masks.get(agent, free) for agent in self._agents], axis=1)
 
     def _stack(self, obs: TeamObs) -> Any:
-        own = [obs[agent] for agent in self._agents]
+        own: list[Any] = [obs[agent] for agent in self._agents]
         if isinstance(own[0], dict):
-            stacked = {key: np.stack([part[key] for part in own], axis=1) for key in own[0]}
-            return {**stacked, AGENT_ID: self._ids(len(next(iter(stacked.values()))))} if self._agent_id else stacked
-        rows = np.stack(own, axis=1)
-        return np.concatenate([rows, self._ids(len(rows)).astype(rows.dtype)], axis=-1) if self._agent_id else rows
-
-    def _ids(self, n_rows: int) -> np.ndarray:
-        n = len(self._agents)
-        return np.broadcast_to(np.eye(n, dtype=np.float32), (n_rows, n, n))
+            return {key: np.stack([part[key] for part in own], axis=1) for key in own[0]}
+        return np.stack(own, axis=1)
 
     # The rest is the team's environment's
 
@@ -182,7 +188,7 @@ class SharedVecEnv(VecEnvWrapper):
                     # SB3 normalises it only where the whole copy is done
                     last = info["rows"]["last"]
                     last = last if self._statistics is None else self._statistics.normalize_obs(last)
-                    own = {**own, "terminal_observation": _row(last, agent)}
+                    own = {**own, "terminal_observation": row_of(last, agent)}
                 rows.append(own)
         rewards, ended = (np.concatenate([info["rows"][name] for info in infos]) for name in ("rewards", "dones"))
         return to_rows(obs), rewards, ended, rows
@@ -257,34 +263,17 @@ def to_rows(stacked: Any) -> Any:
     return stacked.reshape(-1, *stacked.shape[2:])
 
 
-def _row(values: Any, index: int) -> Any:
-    return {key: part[index] for key, part in values.items()} if isinstance(values, dict) else values[index]
-
-
-def _one_row(value: Any) -> Any:
-    return {key: np.asarray(part)[None] for key, part in value.items()} if isinstance(value, dict) else np.asarray(value)[None]
-
-
-def _equal_spaces(found: Any, agents: Sequence[str], kind: str) -> spaces.Space:
-    first = found[agents[0]]
-    for agent in agents[1:]:
-        if found[agent] != first:
-            raise ValueError(
-                f"Agents that share weights need equal spaces, but the {kind} space of {agents[0]!r} is {first} and that of"
-                f" {agent!r} is {found[agent]}: pad them (supersuit.pad_observations_v0, pad_action_space_v0), or train"
-                " one model for each agent (--algo ippo, mappo)."
-            )
-    return first
-
-
-def _with_id(space: spaces.Space, n: int) -> spaces.Space:
-    identity = spaces.Box(0.0, 1.0, (n,), dtype=np.float32)
-    if isinstance(space, spaces.Dict) and AGENT_ID not in space.spaces:
-        return spaces.Dict({**space.spaces, AGENT_ID: identity})
-    if isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
-        low, high = (np.concatenate([own, bound]) for own, bound in ((space.low, identity.low), (space.high, identity.high)))
-        return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype)
-    raise ValueError(
-        f"agent_id=True appends the agent's id to a vector of floats, or to a Dict as the entry {AGENT_ID!r}, but the"
-        f" observation space is {space}: use agent_id=False."
-    )
+def _equal_spaces(env: TeamVecEnv) -> tuple[spaces.Space, spaces.Space]:
+    """Return the observation and the action space that all agents have."""
+    agents, common = env.possible_agents, []
+    for kind, found in (("observation", env.observation_space), ("action", env.action_space)):
+        first: spaces.Space = found[agents[0]]  # type: ignore[index]
+        for agent in agents[1:]:
+            if found[agent] != first:  # type: ignore[index]
+                raise ValueError(
+                    f"Agents that share weights need equal spaces, but the {kind} space of {agents[0]!r} is {first} and that"
+                    f" of {agent!r} is {found[agent]}: pad them (supersuit.pad_observations_v0, pad_action_space_v0), or"  # type: ignore[index]
+                    " train one model for each agent (--algo ippo, mappo)."
+                )
+        common.append(first)
+    return common[0], common[1]

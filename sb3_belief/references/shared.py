@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from sb3_belief.references.adapters import SharedVecEnv, to_rows
+from sb3_belief.references.mappo import MAPPO, OWN, MaskableMAPPO
 
 SelfShared = TypeVar("SelfShared", bound="SharedWeightsMixin")
 
@@ -71,7 +72,7 @@ class SharedWeightsMixin(_Algorithm):
         """
         return super().learn(total_timesteps * self.n_agents, *args, **kwargs)
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
@@ -99,6 +100,9 @@ class SharedWeightsMixin(_Algorithm):
         if isinstance(observation, Mapping):
             key = next(iter(observation))
             observation, space = observation[key], space[key]
+        elif isinstance(space, spaces.Dict):
+            # An agent's own, without what only the critic sees
+            space = space[OWN]
         return np.ndim(observation) == len(space.shape) + 1
 
 
@@ -111,12 +115,18 @@ class SharedPPO(SharedWeightsMixin, BeliefPPO):
     """
 
 
-class MaskableSharedPPO(SharedWeightsMixin, MaskableBeliefPPO):  # type: ignore[misc]
+class SharedMAPPO(SharedWeightsMixin, MAPPO):
     """
-    PPO with one model for all agents and invalid action masking. It shares weights: not decentralised. See :class:`SharedPPO`.
+    MAPPO with one model for all agents of a team, as it is mostly published.
 
-    All arguments are those of ``MaskableBeliefPPO``, whose belief is ``"none"`` here.
+    It shares weights: not decentralised, and uses the global state in training. All arguments are those of
+    :class:`~sb3_belief.references.mappo.MAPPO`. Its environment is made by
+    :func:`~sb3_belief.references.adapters.shared_with_state`.
     """
+
+
+class MaskableSharedWeightsMixin(SharedWeightsMixin):
+    """The same with action masks, one row for each agent."""
 
     def predict(  # type: ignore[override]
         self,
@@ -139,3 +149,19 @@ class MaskableSharedPPO(SharedWeightsMixin, MaskableBeliefPPO):  # type: ignore[
         if action_masks is not None and self._is_of_teams(observation):
             action_masks = np.reshape(action_masks, (len(action_masks) * self.n_agents, -1))
         return super().predict(observation, state, episode_start, deterministic, action_masks=action_masks)
+
+
+class MaskableSharedPPO(MaskableSharedWeightsMixin, MaskableBeliefPPO):  # type: ignore[misc]
+    """
+    PPO with one model for all agents and invalid action masking. It shares weights: not decentralised. See :class:`SharedPPO`.
+
+    All arguments are those of ``MaskableBeliefPPO``, whose belief is ``"none"`` here.
+    """
+
+
+class MaskableSharedMAPPO(MaskableSharedWeightsMixin, MaskableMAPPO):  # type: ignore[misc]
+    """
+    MAPPO with one model for all agents and invalid action masking. See :class:`SharedMAPPO`.
+
+    It shares weights: not decentralised, and uses the global state in training. All arguments are those of ``MaskableMAPPO``.
+    """

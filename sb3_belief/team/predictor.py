@@ -26,6 +26,11 @@ def takes_masks(model: BaseAlgorithm) -> bool:
     return _has_masks_argument(getattr(model.predict, "__func__", model.predict))
 
 
+def _misses_masks(model: BaseAlgorithm) -> bool:
+    """Tell whether a model acts otherwise than in training if it is given no masks."""
+    return takes_masks(model) and getattr(model, "learned_with_masks", True)
+
+
 @cache
 def _has_masks_argument(predict: Callable[..., Any]) -> bool:
     # Asked for each agent at each prediction, and slow to find out
@@ -154,7 +159,7 @@ class TeamPredictor:
             check_agent_keys("The observation", observation, list(self._models))
         except ValueError as error:
             raise ValueError(f"{error}{partners_hint(self._scripted, observation)}") from None
-        if action_masks is None and not self._has_warned and self.takes_masks:
+        if action_masks is None and not self._has_warned and any(map(_misses_masks, self._models.values())):
             self._has_warned = True
             warnings.warn(
                 "A team whose models take action masks predicts without any, and so with other actions than in training. SB3's"

@@ -3,7 +3,8 @@ What one agent is given of a team's joint steps: its own observation, reward and
 could see. :class:`AgentVecEnv` is the vectorised environment that the agent's model learns in.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
@@ -105,11 +106,12 @@ class AgentVecEnv(VecEnv):
 
     ``infos[e]`` holds ``others_actions`` float32 ``[W]`` (the others in order, the scripted ones last: one-hot for Discrete
     and MultiDiscrete, values for Box and MultiBinary; zero where not visible), ``others_visible`` bool ``[n_others]`` and
-    ``active`` bool. At a done it also holds ``terminal_observation`` and ``TimeLimit.truncated``, and at the end of the team's
-    episode ``terminal_action_masks`` (the agent's own, bool ``[k]``, in an environment with masks), ``episode`` (with the
-    agent's own return) and ``is_success``. The global state never reaches an agent. What the environment's own info of the
-    agent holds besides (``infos[agent]["fuel"]``) is there under the same keys. ``get_attr("others_action_spaces")`` returns
-    the spaces of the others, and ``env_method("action_masks")`` the agent's own masks where the environment has masks.
+    ``active`` bool. At a done it also holds ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_action_masks`` (the
+    agent's own masks after its last step, bool ``[k]``, in an environment with masks), ``truncated`` True where a limit has
+    cut its return off, also while it was out of play, and at the end of the team's episode ``episode`` (with the agent's own
+    return) and ``is_success``. The global state never reaches an agent. What the environment's own info of the agent holds
+    besides (``infos[agent]["fuel"]``) is there under the same keys. ``get_attr("others_action_spaces")`` returns the spaces of
+    the others, and ``env_method("action_masks")`` the agent's own masks where the environment has masks.
 
     :param source: Steps the team
     :param agent: Name of the agent
@@ -119,8 +121,9 @@ class AgentVecEnv(VecEnv):
         self.agent = agent
         self._source = source
         self._actions = np.zeros(0)
-        self._others_action_spaces = {other: space for other, space in source.action_spaces.items() if other != agent}
-        self._others_action_spaces.update(source.scripted_action_spaces)
+        others = {other: space for other, space in source.action_spaces.items() if other != agent}
+        # Copies: a space has a random generator, which is its owner's
+        self._others_action_spaces = deepcopy({**others, **source.scripted_action_spaces})
         super().__init__(source.num_envs, source.observation_spaces[agent], source.action_spaces[agent])
 
     def reset(self) -> np.ndarray:
@@ -256,12 +259,15 @@ class TransitionSplitter:
         """
         return [transition.as_step() for transition in self.transitions(actions, step)]
 
-    def transitions(self, actions: TeamObs, step: TeamStep) -> list[AgentTransition]:
+    def transitions(
+        self, actions: TeamObs, step: TeamStep, masks: Callable[[], Mapping[str, np.ndarray] | None] | None = None
+    ) -> list[AgentTransition]:
         """
         Split a joint step into each agent's part.
 
         :param actions: The actions that led to the step, ``[num_envs, ...]`` by agent
         :param step: What ``TeamVecEnv.step`` returned for them
+        :param masks: Returns the masks for the present observations, bool ``[num_envs, k]`` by agent; None without masks
         :return: Each agent's part, in order
         :raises ValueError: If the infos lack visibility or scripted actions, or hold them in another shape
         """
@@ -278,13 +284,17 @@ class TransitionSplitter:
         cut = truncated & ~life_end & active
         seen_actions = self._seen_actions(actions, visible, infos)
         any_done = bool(dones.any())
+        # Where only an agent's own return ends nothing is reset, so the present masks are those after its last step
+        present = masks() if masks is not None and any_done and not team_dones.all() else None
         by_agent = [info["agent_infos"] if "agent_infos" in info else {} for info in infos]
         any_own = any(by_agent)
 
         transitions: list[AgentTransition] = []
         for i, agent in enumerate(self._agents):
             ends = {
-                int(env_idx): self._end(i, row_of(obs[agent], int(env_idx)), bool(cut[env_idx, i]), infos[env_idx])
+                int(env_idx): self._end(
+                    i, int(env_idx), row_of(obs[agent], int(env_idx)), bool(cut[env_idx, i]), infos[env_idx], present
+                )
                 for env_idx in (np.flatnonzero(dones[:, i]) if any_done else ())
             }
             others = seen_actions[:, self._others[i]]
@@ -294,12 +304,18 @@ class TransitionSplitter:
             )
         return transitions
 
-    def _end(self, i: int, obs: Any, cut: bool, info: dict[str, Any]) -> dict[str, Any]:
+    def _end(
+        self, i: int, env_idx: int, obs: Any, cut: bool, info: dict[str, Any], masks: Mapping[str, np.ndarray] | None
+    ) -> dict[str, Any]:
         """Return what SB3 expects in the info of a done. Where only the agent's own return has ended, nothing is reset."""
         end = {"terminal_observation": info.get("terminal_observation", {}).get(self._agents[i], obs)}
         end["TimeLimit.truncated"] = cut
+        if info["truncated"][i]:
+            end["truncated"] = True
         if self._agents[i] in info.get("terminal_action_masks", ()):
             end["terminal_action_masks"] = info["terminal_action_masks"][self._agents[i]]
+        elif masks is not None and self._agents[i] in masks:
+            end["terminal_action_masks"] = masks[self._agents[i]][env_idx]
         if "episode" in info:
             end["episode"] = {**info["episode"], "r": float(info["agent_episode_rewards"][i])}
             if "is_success" in info:

@@ -88,9 +88,12 @@ def _import(path: str) -> Any:
 #: What is said of models that all agents have in common
 SHARED = "shares weights: not decentralised"
 _NO_BELIEF: Mapping[str, Any] = MappingProxyType({"belief": "none"})
-_SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
+_AMF: Mapping[str, Any] = MappingProxyType({"belief": "static", "action_loss": "cross_entropy", "detach_belief": False})
 #: What is said of references that learn centrally
 CENTRAL = "uses the global state in training"
+_STATE = "sb3_belief.references.with_state:with_state"
+_SHARED_STATE = "sb3_belief.references.adapters:shared_with_state"
+_SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
 _JOINT = "sb3_belief.references.joint_vec_env:joint_team"
 
 
@@ -105,10 +108,23 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "belief_ppo": Algo("sb3_belief.belief_ppo:BeliefPPO"),
         "ippo": Algo("sb3_belief.belief_ppo:BeliefPPO", _NO_BELIEF),
         "ippo_wide": Algo("sb3_belief.belief_ppo:BeliefPPO", MappingProxyType({"belief": "wide"})),
+        "amf_ppo": Algo("sb3_belief.baselines.amf:AMFPPO", _AMF),
+        "maskable_amf_ppo": Algo("sb3_belief.baselines.amf:MaskableAMFPPO", _AMF),
+        "iac": Algo("sb3_belief.baselines.iac:IAC"),
         "ippo_shared": Algo("sb3_belief.references.shared:SharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED),
         "maskable_ippo_shared": Algo(
             "sb3_belief.references.shared:MaskableSharedPPO", _NO_BELIEF, adapter=_SHARED_WEIGHTS, note=SHARED
         ),
+        **{
+            name: Algo(f"sb3_belief.references.{path}", _NO_BELIEF, adapter=adapter, note=note)
+            for name, path, adapter, note in (
+                ("mappo", "mappo:MAPPO", _STATE, CENTRAL),
+                ("maskable_mappo", "mappo:MaskableMAPPO", _STATE, CENTRAL),
+                ("mappo_shared", "shared:SharedMAPPO", _SHARED_STATE, f"{CENTRAL}, {SHARED}"),
+                ("maskable_mappo_shared", "shared:MaskableSharedMAPPO", _SHARED_STATE, f"{CENTRAL}, {SHARED}"),
+            )
+        },
+        "iql": Algo("sb3_belief.baselines:IQL"),
         "maskable_belief_ppo": Algo("sb3_belief.belief_ppo:MaskableBeliefPPO"),
         "ppo": Algo("stable_baselines3:PPO"),
         "a2c": Algo("stable_baselines3:A2C"),

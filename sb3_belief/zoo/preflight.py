@@ -209,8 +209,9 @@ def agent_without_masks(config: RunConfig, env: TeamVecEnv) -> str | None:
     """
     masks = env.action_masks() or {}
     for agent in env.possible_agents:
-        takes_masks = "action_masks" in signature(config.agent(agent).algo_class.predict).parameters
-        if takes_masks and agent not in masks:
+        algo_class: Any = config.agent(agent).algo_class
+        takes_masks = "action_masks" in signature(algo_class.predict).parameters
+        if takes_masks and getattr(algo_class, "needs_action_masks", True) and agent not in masks:
             return agent
     return None
 

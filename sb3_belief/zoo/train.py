@@ -15,10 +15,12 @@ from sb3_belief.common.threads import use_threads
 from sb3_belief.team import Team, TeamVecEnv, make_team_env
 from sb3_belief.team.agent_models import env_seed
 from sb3_belief.vec_env.observe_last import with_last_step
+from sb3_belief.vec_env.states import ENVIRONMENT
 from sb3_belief.zoo.config import RunConfig
 from sb3_belief.zoo.endings import EndSignals
 from sb3_belief.zoo.errors import ConfigError, cause
 from sb3_belief.zoo.learning import RunCallbacks, learn_and_save
+from sb3_belief.zoo.names import CENTRAL
 from sb3_belief.zoo.preflight import (
     agent_without_masks,
     check_copies,
@@ -80,6 +82,7 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
             options.command,
             algo=config.algo,
             note=config.note,
+            state=env.state_source if CENTRAL in config.note else "",
             env=config.env_id,
             seed=seed,
             source=config.source,
@@ -99,9 +102,15 @@ def train(config: RunConfig, options: TrainOptions, after_eval: BaseCallback | N
             if options.verbose:
                 print(f"Run folder: {folder}  (seed {seed})")
                 if config.note:
-                    print(f"{config.algo} {config.note}.")
+                    print(f"{config.algo} {config.note}{_state(config, env)}.")
             # A team that continues its training continues counting its steps
             return learn_and_save(team, config, options, folder, record, callbacks, signals, trained is None)
+
+
+def _state(config: RunConfig, env: TeamVecEnv) -> str:
+    if CENTRAL not in config.note:
+        return ""
+    return f" (the {'environment has its own' if env.state_source == ENVIRONMENT else 'observations of all agents'})"
 
 
 def track(tracking: Tracking | None, callbacks: RunCallbacks, record: RunRecord, stack: ExitStack) -> None:

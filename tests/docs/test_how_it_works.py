@@ -112,9 +112,9 @@ def joint_step() -> Entered:
 @pytest.mark.parametrize(
     "title, path, most",
     [
-        ("A rollout step of BeliefPPO", rollout_step, 7),
-        ("A minibatch of an update", minibatch, 6),
-        ("A joint step of a team", joint_step, 17),
+        ("A rollout step of BeliefPPO", rollout_step, 8),
+        ("A minibatch of an update", minibatch, 9),
+        ("A joint step of a team", joint_step, 18),
     ],
 )
 def test_the_lists_are_the_paths(title, path, most):

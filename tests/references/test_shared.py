@@ -14,6 +14,7 @@ from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.cli.main import main
 from sb3_belief.references.adapters import SharedVecEnv, StackedVecEnv, row_space, shared_weights, stacked_space
 from sb3_belief.references.shared import MaskableSharedPPO, SharedPPO
+from sb3_belief.references.with_state import WithAgentId
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.errors import ConfigError
@@ -41,7 +42,7 @@ def masked_env(n_agents=2):
 @pytest.mark.parametrize("agent_id", [False, True])
 def test_a_row_is_what_the_agents_own_environment_would_have_been(agent_id):
     env, twin = (make_team_env(ScriptedEnv, n_envs=3, seed=0) for _ in range(2))
-    rows = SharedVecEnv(StackedVecEnv(env, agent_id))
+    rows = SharedVecEnv(StackedVecEnv(WithAgentId(env) if agent_id else env))
     agents = twin.possible_agents
     splitter = TransitionSplitter(agents, dict(twin.action_space.spaces))
     n = len(agents)
@@ -67,7 +68,7 @@ def test_a_row_is_what_the_agents_own_environment_would_have_been(agent_id):
         for copy in range(3):
             for i, (own_obs, own_rewards, own_dones, own_infos) in enumerate(steps):
                 row = copy * n + i
-                check(obs[row], i, own_obs[copy])
+                check(obs[row], i, own_obs[copy])  # type: ignore[index]
                 assert (rewards[row], dones[row]) == (own_rewards[copy], own_dones[copy])
                 mine, theirs = infos[row], own_infos[copy]
                 assert mine["active"] == theirs["active"]

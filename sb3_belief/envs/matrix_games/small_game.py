@@ -21,19 +21,28 @@ class SmallGame(TeamGame[np.ndarray, int]):
     :param observations: Space of an agent's observation
     :param width: Number of entries of the global state
     :param n_steps: Number of steps of an episode, at least 1
+    :param reward_scale: What rewards are multiplied by, for learners whose loss is not squared where errors exceed 1
     :raises ValueError: If there is no agent or no step
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "matrix_games", "render_modes": [], "is_parallelizable": True}
 
-    def __init__(self, n_agents: int, n_actions: int, observations: spaces.Box, width: int, n_steps: int = 1):
+    def __init__(
+        self,
+        n_agents: int,
+        n_actions: int,
+        observations: spaces.Box,
+        width: int,
+        n_steps: int = 1,
+        reward_scale: float = 1.0,
+    ):
         for name, given in (("n_agents", n_agents), ("n_steps", n_steps)):
             if given < 1:
                 raise ValueError(f"{name}={given} must be at least 1.")
         self.possible_agents = [f"agent_{i}" for i in range(n_agents)]
         self.agents: list[str] = []
         self.render_mode = None
-        self.n_actions, self.n_steps, self.t = n_actions, n_steps, 0
+        self.n_actions, self.n_steps, self.reward_scale, self.t = n_actions, n_steps, reward_scale, 0
         self.observation_spaces = {
             agent: spaces.Box(observations.low, observations.high, dtype=np.float32) for agent in self.possible_agents
         }
@@ -92,7 +101,7 @@ class SmallGame(TeamGame[np.ndarray, int]):
                     f"The action of {agent!r} is {action!r}; every agent needs one, from 0 to {self.n_actions - 1}."
                 )
             chosen.append(int(action))
-        rewards = self._rewards(chosen)
+        rewards = [self.reward_scale * reward for reward in self._rewards(chosen)]
         self.t += 1
         over = self.t >= self.n_steps
         if over:

@@ -16,10 +16,12 @@ class TwoStep(SmallGame):
     In the first step the first agent's action chooses the table of the second step, and nothing is paid: 0 leads to 2A, in
     which every joint action pays 7, and 1 to 2B, which pays ``[[0, 1], [1, 8]]``. Observations and state are one-hot: first
     step, 2A, 2B. After the second step they remain what they were.
+
+    :param reward_scale: What payoffs are multiplied by
     """
 
-    def __init__(self) -> None:
-        super().__init__(2, 2, spaces.Box(0, 1, (3,)), 3, 2)
+    def __init__(self, reward_scale: float = 1.0) -> None:
+        super().__init__(2, 2, spaces.Box(0, 1, (3,)), 3, 2, reward_scale)
         self._one_hot = np.eye(3, dtype=np.float32)
         self.place = 0
 

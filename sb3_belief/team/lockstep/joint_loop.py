@@ -381,7 +381,7 @@ class JointLoop(Scheduler):
         if self._wrapper_check.wrappers:
             self._wrapper_check.check(step)
         self._masks_known = False
-        transitions = self._splitter.transitions(actions, step)
+        transitions = self._splitter.transitions(actions, step, lambda: self.masks)
         self._hand_out(dict(zip(self.possible_agents, transitions, strict=True)))
         for group in self._groups:
             group.step(self._transitions, self.masks)

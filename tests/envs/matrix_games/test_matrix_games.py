@@ -55,6 +55,19 @@ def test_permutation(n, uniform):
     assert table(make_parallel_env("permutation", n=n)).mean() == pytest.approx(uniform, abs=1e-4)
 
 
+@pytest.mark.parametrize("env_id", ["climbing", "qplex-matrix", "permutation", "two-step"])
+def test_payoffs_are_scaled(env_id):
+    env, scaled = make_parallel_env(env_id), make_parallel_env(env_id, reward_scale=0.1)
+    for each in (env, scaled):
+        each.reset()
+    joint = {"agent_0": 1, "agent_1": 0}
+    if env_id == "two-step":
+        env.step(joint)
+        scaled.step(joint)
+    reward = env.step(joint)[1]["agent_0"]
+    assert reward and scaled.step(joint)[1]["agent_0"] == pytest.approx(0.1 * reward)
+
+
 def test_a_table_is_played_n_times_an_episode():
     env = make_team_env("climbing", env_kwargs={"n_steps": 25})
     env.reset()

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.baselines import IQL
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 from tests.team.toy_envs import MixedEnv, ScriptedEnv, ToyEnv
 
@@ -82,6 +83,7 @@ CASES: dict[str, tuple[Any, str, Any, dict[str, Any]]] = {
     "maskable": (MaskablePPO, "MlpPolicy", EASY, PPO_KWARGS),
     "recurrent": (RecurrentPPO, "MlpLstmPolicy", ToyEnv, {**PPO_KWARGS, "normalize": True}),
     "dqn": (DQN, "MlpPolicy", ToyEnv, {**OFF, "target_update_interval": 30, "normalize": True, "exploration_fraction": 0.9}),
+    "iql": (IQL, "MlpPolicy", EASY, {**OFF, "exploration_fraction": 0.9}),
     "qrdqn": (QRDQN, "MlpPolicy", ToyEnv, OFF),
     "sac": (SAC, "MlpPolicy", pushes, {**OFF, "use_sde": True}),
     "td3": (TD3, "MlpPolicy", pushes, {**OFF, "action_noise": noise()}),
