@@ -12,6 +12,8 @@ RL_ZOO3_VENV := .venv-rl-zoo3
 RL_ZOO3_STAMP := $(RL_ZOO3_VENV)/.installed
 STATISTICS_VENV := .venv-statistics
 STATISTICS_STAMP := $(STATISTICS_VENV)/.installed
+ORACLE_VENV := .venv-oracle
+ORACLE_STAMP := $(ORACLE_VENV)/.installed
 PACKAGE_VENV := .venv-package
 PACKAGE_STAMP := $(VENV)/.installed-package
 PEERS_VENV := .venv-peers
@@ -26,7 +28,7 @@ BENCH_ARGS ?=
 SOAK_MINUTES ?= 60
 SOAK_SEED ?= 0
 
-.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-trackers test-statistics pytest conformance soak bench bench-peers docs package \
+.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-trackers test-statistics test-oracle pytest conformance soak bench bench-peers docs package \
 	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -123,6 +125,16 @@ test-statistics: $(STAMP) $(STATISTICS_STAMP)  ## compare our statistics with rl
 	$(BIN)/python -m pytest tests/report/test_statistics.py \
 		tests/report/test_bands.py tests/report/test_marl_eval.py $(PYTEST_ARGS)
 
+# torchrl has an environment of its own, since nothing but this test needs it
+$(ORACLE_STAMP): setup.cfg constraints.txt
+	$(PYTHON) -m venv $(ORACLE_VENV)
+	$(ORACLE_VENV)/bin/python -m pip install --quiet -c constraints.txt torch
+	$(ORACLE_VENV)/bin/python -m pip install --quiet -c constraints.txt -e '.[oracle]'
+	@touch $@
+
+test-oracle: $(STAMP) $(ORACLE_STAMP)  ## compare our QMIX mixer with torchrl's, in an environment of its own
+	$(BIN)/python -m pytest tests/references/test_torchrl.py $(PYTEST_ARGS)
+
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
@@ -158,5 +170,5 @@ check-codestyle: $(STAMP)  ## check imports and format, changing nothing
 commit-checks: format type lint  ## what to run before a commit
 
 clean:  ## remove the virtual environment and all caches (runs in logs/ stay)
-	rm -rf $(VENV) $(SMAX_VENV) $(RL_ZOO3_VENV) $(STATISTICS_VENV) $(PACKAGE_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf $(VENV) $(SMAX_VENV) $(RL_ZOO3_VENV) $(STATISTICS_VENV) $(ORACLE_VENV) $(PACKAGE_VENV) $(PEERS_VENV) docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -27,3 +27,16 @@ def check_flag(name: str, value: object) -> None:
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name}={value!r} must be True or False.")
+
+
+def check_share(name: str, value: object, meaning: str) -> None:
+    """
+    Check an argument that is a share, or a probability.
+
+    :param name: Name of the argument
+    :param value: What the user gave
+    :param meaning: What the argument is, for the message
+    :raises ValueError: If it is no number in [0, 1]
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
+        raise ValueError(f"{name}={value!r} must be a number in [0, 1]: {meaning}.")

@@ -94,6 +94,12 @@ CENTRAL = "uses the global state in training"
 _STATE = "sb3_belief.references.with_state:with_state"
 _SHARED_STATE = "sb3_belief.references.adapters:shared_with_state"
 _SHARED_WEIGHTS = "sb3_belief.references.adapters:shared_weights"
+_JOINT = "sb3_belief.references.joint_vec_env:joint_team"
+
+
+def _factorised(mixer: str) -> Algo:
+    path = "sb3_belief.references.factorisation:ValueFactorisation"
+    return Algo(path, MappingProxyType({"mixer": mixer}), adapter=_JOINT, note=CENTRAL)
 
 
 #: The algorithms whose unmodified ``learn()`` runs in a team. ARS is not among them, because it steps its environments itself
@@ -134,6 +140,10 @@ ALGOS: Mapping[str, Algo] = MappingProxyType(
         "qrdqn": Algo("sb3_contrib:QRDQN"),
         "tqc": Algo("sb3_contrib:TQC"),
         "crossq": Algo("sb3_contrib:CrossQ"),
+        "rode": Algo("sb3_belief.references.rode:RODE", adapter=_JOINT, note=CENTRAL),
+        "maddpg": Algo("sb3_belief.references.maddpg:MADDPG", adapter=_JOINT, note=CENTRAL),
+        "coma": Algo("sb3_belief.references.coma:COMA", adapter=_JOINT, note=CENTRAL),
+        **{mixer: _factorised(mixer) for mixer in ("vdn", "qmix", "qplex", "qtran")},
     }
 )
 

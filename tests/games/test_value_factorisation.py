@@ -1,0 +1,58 @@
+"""
+What factorised values learn in games whose exact answers are known (docs/baselines/centralised.md).
+
+Who must succeed by the mathematics does, who must fail does; what has no theorem is reported on that page.
+"""
+
+import numpy as np
+import pytest
+
+from studies.joint_games import play
+
+SEEDS = range(5)
+# Uniform play, gamma .99: the best value of each first action, and the tables of the second step
+EXACT: dict[str, list] = {"start": [6.93, 7.92], "2A": [[7.0, 7.0], [7.0, 7.0]], "2B": [[0.0, 1.0], [1.0, 8.0]]}
+# The best sum in the place of 2B is worth 6.5, which the target's maximum carries to the first step
+ADDED: dict[str, list] = {**EXACT, "start": [6.93, 6.435], "2B": [[-1.5, 2.5], [2.5, 6.5]]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["vdn", "qmix", "qplex", "qtran"])
+def test_two_steps(algo):
+    for seed in SEEDS:
+        played = play(algo, "two-step", seed)
+        assert played.returned == (7 if algo == "vdn" else 8)
+        for name, expected in (ADDED if algo == "vdn" else EXACT).items():
+            np.testing.assert_allclose(played.tables[name], expected, atol=0.3, err_msg=f"{name}, seed {seed}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("game", "returned"), [("climbing", 5), ("penalty", 2), ("qtran-matrix", 0)])
+def test_a_sum_cannot_see_the_best(game, returned):
+    assert [play("vdn", game, seed).returned for seed in SEEDS] == [returned] * 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [-25.0, -50.0])
+def test_a_sum_shuns_every_penalty(k):
+    assert [play("vdn", "penalty", seed, {"k": k}).returned for seed in SEEDS] == [2] * 5
+
+
+@pytest.mark.slow
+def test_a_sum_fits_qtrans_matrix_as_well_as_it_can():
+    expected = [[-6.22, -4.89, -4.89], [-4.89, -3.56, -3.56], [-4.89, -3.56, -3.56]]
+    for seed in SEEDS:
+        np.testing.assert_allclose(play("vdn", "qtran-matrix", seed).tables["payoffs"], expected, atol=1.5)
+
+
+@pytest.mark.slow
+def test_qtran_finds_the_best_of_its_matrix():
+    assert [play("qtran", "qtran-matrix", seed).returned for seed in SEEDS] == [8] * 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("game", ["qtran-matrix", "qplex-matrix"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_qplex_finds_the_best(game, seed):
+    played = play("qplex", game, seed)
+    assert played.returned == 8 and played.tables["payoffs"][0, 0] == pytest.approx(8, abs=0.5)
