@@ -27,12 +27,12 @@ from sb3_belief.zoo.train import make_env, make_team
 from sb3_belief.zoo.train_options import TrainOptions
 from sb3_belief.zoo.yaml_data import read_file
 
-# In place of an environment that is not installed. No configuration file has a section for it
-_STAND_IN = "sb3_belief.envs.switching_convention.parallel_env:SwitchingConvention"
+# In place of an environment that is not installed: one of vectors and masks. No configuration file has a section for it
+_STAND_IN = "sb3_belief.envs.traffic_junction.parallel_env:TrafficJunction"
 # Settings that only the environment itself can check
-_OF_ENV = ("env_kwargs", "eval_env_kwargs", "env_wrapper", "observe_last", "memory_span", "agent_kwargs")
+_OF_ENV = ("env_kwargs", "eval_env_kwargs", "env_wrapper", "observe_last", "observe_window", "memory_span", "agent_kwargs")
 # Settings of which a team's environment is made
-_OBSERVED = ("env_kwargs", "env_wrapper", "visibility", "observe_last", "memory_span")
+_OBSERVED = ("env_kwargs", "env_wrapper", "visibility", "observe_last", "observe_window", "memory_span", "adapter_kwargs")
 # A team of agents with rollouts of one step needs two copies
 _COPIES = 2
 
@@ -170,7 +170,9 @@ def _check_environment(study: Study, configs: dict[str, RunConfig]) -> None:
             check_copies(config.n_envs, study.train.get("vec_env", "dummy"), config.origin("n_envs"))
             check_copies(study.evaluation.copies, "dummy", f"{study.source}: evaluation: copies")
             check_optimizers(config, "cpu")
-            kind = {name: config.settings.get(name) for name in _OBSERVED}
+            # A central learner's is another one, whatever it observes
+            adapter = getattr(config.adapter, "func", None)
+            kind = adapter, {name: config.settings.get(name) for name in _OBSERVED}
             found = [env for other, env in tried if other == kind]
             env = found[0] if found else _made_environment(config, seed, stack)
             if not found:

@@ -27,6 +27,7 @@ def test_all_are_there():
         "adaptive_ablations",
         *aisles,
         "changing_teammates_gate",
+        "comparison",
         "convention",
         "convention_episode",
         "lbf",
@@ -47,7 +48,7 @@ def test_a_dry_run_of_each(name, tmp_path, capsys):
         # Never for another reason than an environment that is not here, and then all others have been checked
         assert status == 2 and "which is not installed" in captured.err
         assert captured.err.endswith("All that does not need it has been checked.\n")
-        assert name in ("lbf", "smac_paper", "smax", "speaker_listener")
+        assert name in ("comparison", "lbf", "smac_paper", "smax", "speaker_listener")
     assert not list(tmp_path.iterdir())
 
 
