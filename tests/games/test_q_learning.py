@@ -139,6 +139,6 @@ def success(algorithm: Any, seed: int) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "seed"), [*product([DPIQN, DRPIQN], SEEDS)])
 def test_who_has_no_history_of_the_others_is_as_good_as_a_static_belief(algorithm, seed):
-    # The optimum is .85, chance .25, and this the band of BeliefPPO(belief="static"): what an old convention has in common with
-    # a new one is luck
+    # The optimum is .85, chance .25, and this the band of BeliefPPO(belief="static"): what an old convention has in common
+    # with a new one is luck
     assert 0.14 <= success(algorithm, seed) <= 0.29
