@@ -11,10 +11,10 @@ from sb3_belief.zoo.config import load_config
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("game", "least"), [("cues", 4.8), ("coordination", 0.95)])
-def test_learns(game, least):
-    for seed in range(5):
-        config = load_config("coma", game)
-        env = JointVecEnv(make_team_env(game, n_envs=config.n_envs, seed=seed))
-        model = COMA(config.policy, env, seed=seed, **config.algo_kwargs).learn(config.n_timesteps)
-        returned, _ = evaluate_policy(model, env, 200, deterministic=False)
-        assert isinstance(returned, float) and returned >= least, f"seed {seed}"
+@pytest.mark.parametrize("seed", range(5))
+def test_learns(game, least, seed):
+    config = load_config("coma", game)
+    env = JointVecEnv(make_team_env(game, n_envs=config.n_envs, seed=seed))
+    model = COMA(config.policy, env, seed=seed, **config.algo_kwargs).learn(config.n_timesteps)
+    returned, _ = evaluate_policy(model, env, 200, deterministic=False)
+    assert isinstance(returned, float) and returned >= least
