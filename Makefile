@@ -28,7 +28,7 @@ BENCH_ARGS ?=
 SOAK_MINUTES ?= 60
 SOAK_SEED ?= 0
 
-.PHONY: help install demo test test-slow test-envs test-smax test-rl-zoo3 test-trackers test-statistics test-oracle pytest conformance soak bench bench-peers docs package \
+.PHONY: help install demo test test-slow test-games test-envs test-smax test-rl-zoo3 test-trackers test-statistics test-oracle pytest conformance soak bench bench-peers docs package \
 	lint type format check-codestyle commit-checks clean
 
 help:  ## list the targets
@@ -54,6 +54,9 @@ test: $(STAMP)  ## run all tests but the slow ones
 
 test-slow: $(STAMP)  ## play the games that prove the belief dynamic
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m slow $(PYTEST_ARGS)
+
+test-games: $(STAMP)  ## play the games of the comparison set with five seeds each (most of an hour)
+	GAME_SEEDS=5 $(BIN)/python -m pytest -n $(PYTEST_JOBS) -m slow tests/games $(PYTEST_ARGS)
 
 pytest: test
 

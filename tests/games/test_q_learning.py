@@ -16,9 +16,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_belief import make_team_env
 from sb3_belief.baselines import DPIQN, DRPIQN, IQL
 from sb3_belief.envs import make_parallel_env
+from tests.games.seeds import SEEDS
 from tests.team.helpers import Team
-
-SEEDS = range(5)
 
 
 def values(env_id: str, seed: int, scale: float, n_timesteps: int, gamma: float = 0.0, **env_kwargs: Any) -> list[np.ndarray]:

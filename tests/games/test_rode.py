@@ -7,8 +7,7 @@ from sb3_belief import make_team_env
 from sb3_belief.references.joint_vec_env import JointVecEnv
 from sb3_belief.references.rode import RODE
 from sb3_belief.zoo.config import load_config
-
-SEEDS = range(5)
+from tests.games.seeds import SEEDS
 
 
 @pytest.mark.slow

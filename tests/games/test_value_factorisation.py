@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from studies.joint_games import play
+from tests.games.seeds import SEEDS
 
-SEEDS = range(5)
 # Uniform play, gamma .99: the best value of each first action, and the tables of the second step
 EXACT: dict[str, list] = {"start": [6.93, 7.92], "2A": [[7.0, 7.0], [7.0, 7.0]], "2B": [[0.0, 1.0], [1.0, 8.0]]}
 # The best sum in the place of 2B is worth 6.5, which the target's maximum carries to the first step
@@ -29,13 +29,13 @@ def test_two_steps(algo):
 @pytest.mark.slow
 @pytest.mark.parametrize(("game", "returned"), [("climbing", 5), ("penalty", 2), ("qtran-matrix", 0)])
 def test_a_sum_cannot_see_the_best(game, returned):
-    assert [play("vdn", game, seed).returned for seed in SEEDS] == [returned] * 5
+    assert [play("vdn", game, seed).returned for seed in SEEDS] == [returned] * len(SEEDS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [-25.0, -50.0])
 def test_a_sum_shuns_every_penalty(k):
-    assert [play("vdn", "penalty", seed, {"k": k}).returned for seed in SEEDS] == [2] * 5
+    assert [play("vdn", "penalty", seed, {"k": k}).returned for seed in SEEDS] == [2] * len(SEEDS)
 
 
 @pytest.mark.slow
@@ -47,7 +47,7 @@ def test_a_sum_fits_qtrans_matrix_as_well_as_it_can():
 
 @pytest.mark.slow
 def test_qtran_finds_the_best_of_its_matrix():
-    assert [play("qtran", "qtran-matrix", seed).returned for seed in SEEDS] == [8] * 5
+    assert [play("qtran", "qtran-matrix", seed).returned for seed in SEEDS] == [8] * len(SEEDS)
 
 
 @pytest.mark.slow
