@@ -46,6 +46,8 @@ class DetailsPolicyMixin(_Policy):
     #: Weight of their loss, and what it has been in the minibatches of this update
     value_coef: float = 0.0
     value_losses: list[float]
+    #: Mean and deviation of the returns while the rollout was played, the unit of its values
+    acted_in: tuple[th.Tensor, th.Tensor] | None = None
     value_norm: bool
     obs_layer_norm: bool
     action_gain: float
@@ -119,7 +121,12 @@ class DetailsPolicyMixin(_Policy):
         targets = getattr(obs, "value_targets", None)
         if targets is None or self.value_options is None:
             return values, log_prob, entropy
-        std = self.value_net.statistics()[1] if isinstance(self.value_net, NormalizedValue) else 1.0
+        std: Any = 1.0
+        if isinstance(self.value_net, NormalizedValue):
+            assert self.acted_in is not None
+            (was_mean, was_std), (mean, std) = self.acted_in, self.value_net.statistics()
+            # What may not move far is the head's prediction, whatever its unit has become since
+            targets = targets._replace(old_values=(targets.old_values - was_mean) / was_std * std + mean)
         loss = value_loss(values.flatten(), targets, std, self.value_options)
         self.value_losses.append(loss.item())
         return add_loss(values, self.value_coef * loss), log_prob, entropy
@@ -169,6 +176,7 @@ class DetailsAlgorithmMixin(ActiveStepsAlgorithmMixin):
         policy, buffer = self.policy, self.rollout_buffer
         if isinstance(policy.value_net, NormalizedValue):
             # Once a rollout, so that its values keep their unit until the next
+            policy.acted_in = policy.value_net.statistics()
             policy.value_net.update(th.as_tensor(buffer.returns[buffer.active]))
         policy.value_options, policy.value_coef, policy.value_losses = options, self.vf_coef, []
         vf_coef, self.vf_coef = self.vf_coef, 0.0

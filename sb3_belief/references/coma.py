@@ -161,6 +161,7 @@ class COMA(OnPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         check_joint_env(env, type(self).__name__)
         super().set_env(env, force_reset)
+        refuse_normalisation(self)
 
     def learn(
         self,

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -188,7 +189,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         if self._n_episodes - self._episodes_updated < self.n_envs or self.replay_buffer.size() < batch_size:
             return
         self._episodes_updated = self._n_episodes
-        self._update_learning_rate(self.policy.optimizer)
+        self._update_learning_rate(self._optimizers)
         logs = [self._update(self.replay_buffer.sample(batch_size)) for _ in range(gradient_steps)]
         self._n_updates += gradient_steps
         if self._n_episodes - self._episodes_copied >= self.target_update_interval:
@@ -232,6 +233,17 @@ class ValueFactorisation(OffPolicyAlgorithm):
 
     # SB3's protocol
 
+    @property
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [self.policy.optimizer]
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        if self._last_states is not None and len(self._last_states[0]) != self.n_envs:
+            # The environment has another number of copies now, which have been reset
+            self._last_states = None
+        return result
+
     def _setup_model(self) -> None:
         refuse_normalisation(self)
         super()._setup_model()
@@ -239,6 +251,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         check_joint_env(env, type(self).__name__)
         super().set_env(env, force_reset)
+        refuse_normalisation(self)
 
     def learn(
         self,

@@ -115,7 +115,8 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         refuse_normalisation(self)
-        if isinstance(self.action_space, spaces.Box) and self.action_noise is None:
+        if isinstance(self.action_space, spaces.Box):
+            # Anew also for a model that is loaded, whose noise was for as many copies as it had; it has no memory
             shape = self.action_space.shape
             self.action_noise = NormalActionNoise(np.zeros(shape), np.full(shape, self.exploration_noise))
         super()._setup_model()
@@ -123,8 +124,10 @@ class MADDPG(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        # SB3's random actions before the first update would not heed the masks; new actors choose nearly at random
-        return super()._sample_action(0, action_noise, n_envs)
+        # SB3's random actions before the first update would not heed the masks of discrete ones. New actors choose these
+        # nearly at random, but not numbers
+        warm_up = learning_starts if isinstance(self.action_space, spaces.Box) else 0
+        return super()._sample_action(warm_up, action_noise, n_envs)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
@@ -204,6 +207,7 @@ class MADDPG(OffPolicyAlgorithm):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         check_joint_env(env, type(self).__name__, _ACTIONS)
         super().set_env(env, force_reset)
+        refuse_normalisation(self)
 
     def learn(
         self,

@@ -114,16 +114,22 @@ class RODE(ValueFactorisation):
 
     def _on_step(self) -> None:
         if self.policy.has_roles:
-            share = min((self.num_timesteps - self.role_start) / self.exploration_steps, 1.0)
+            # Below zero where a model that has roles counts its steps anew
+            share = float(np.clip((self.num_timesteps - self.role_start) / self.exploration_steps, 0.0, 1.0))
             initial, final = self.exploration_initial_eps, self.exploration_final_eps
             self.exploration_rate = (1 - share) * initial + share * final
         else:
             self.exploration_rate = 1.0
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
+    @property
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [*super()._optimizers, self.policy.effects_optimizer]
+
     def train(self, gradient_steps: int, batch_size: int) -> None:
         super().train(gradient_steps, batch_size)
-        if self.num_timesteps >= self.role_start and not self.policy.has_roles:
+        # Before the first update the embeddings that would be grouped are random
+        if self.num_timesteps >= self.role_start and self._n_updates and not self.policy.has_roles:
             self.policy.make_roles(np.random.default_rng(np.random.randint(2**31)))
             self.policy.update_target()
             # Its roles were chosen when they meant nothing

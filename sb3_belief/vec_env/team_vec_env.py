@@ -351,7 +351,10 @@ class TeamVecEnv(GlobalStates, VecEnv):
         self._team_returns, self._agent_returns, self._lengths = state["returns"]
         self.last_rewards, self.last_dones, self.last_agent_rewards = state["last"]
         self.reports_success = state["reports_success"]
-        self._obs = state.get("observations") or self._obs
+        if state.get("observations") is not None:
+            self._obs = state["observations"]
+            # Copies tell their last states only after they have been asked, which the other environment's were
+            self.states()
 
     def _copies_state(self) -> Any:
         """Return what decides how the copies go on, as plain data."""

@@ -356,3 +356,18 @@ def test_yaml_has_them_all():
         config = load_config(algo, "traffic-junction-easy", params=given)
         assert config.algo_kwargs["huber_delta"] == 10.0
         assert config.algo_kwargs["policy_kwargs"]["obs_layer_norm"] is True
+
+
+def test_what_the_clip_stops_does_not_depend_on_where_returns_lie():
+    """The unit of the values is another one after the first rollout, which is no movement of the head."""
+    moved = []
+    for mean in (0.0, 100.0):
+        model = far_model(mean, 3.0, value_norm=True, value_clip=0.2, huber_delta=10.0)
+        before = [weight.clone() for weight in model.policy.value_net.head.parameters()]
+        model.learn(8 * 16)
+        moved.append(
+            [after.detach() - old for after, old in zip(model.policy.value_net.head.parameters(), before, strict=True)]
+        )
+    for near, far in zip(*moved, strict=True):
+        th.testing.assert_close(near, far, atol=2e-3, rtol=0.05)
+    assert moved[1][0].abs().max() > 0.01

@@ -274,3 +274,15 @@ def test_as_the_one_learner_of_a_team(tmp_path):
     assert th.equal(weights(loaded.agents["team"]), weights(model))
     loaded.learn(60, reset_num_timesteps=False)
     assert loaded.num_timesteps == 120
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_a_saved_one_goes_on_in_another_number_of_copies(copies, tmp_path):
+    learner().learn(20).save(tmp_path / "model")
+    loaded = ValueFactorisation.load(tmp_path / "model", env=joint_env(n_envs=copies))
+    assert loaded.learn(12 * copies, reset_num_timesteps=False).num_timesteps >= 20 + 12 * copies
+
+
+def test_normalised_observations_are_refused_later_as_well():
+    with pytest.raises(ValueError, match="does not take normalised observations"):
+        learner().set_env(VecNormalize(joint_env(n_envs=2), norm_obs_keys=["obs"]))

@@ -202,3 +202,22 @@ def test_learns_in_simple_spread(continuous):
     env = JointVecEnv(make_team_env("mpe/simple_spread_v3", n_envs=4, seed=0, env_kwargs=kwargs))
     model = MADDPG("MaddpgPolicy", env, seed=0, batch_size=64, learning_starts=100, train_freq=10).learn(400)
     assert model._n_updates == 8 and parameters(model).isfinite().all()
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_a_saved_one_of_numbers_goes_on_in_another_number_of_copies(copies, tmp_path):
+    def env(n):
+        return JointVecEnv(make_team_env(BoxTeam, n_envs=n))
+
+    learner(env(2)).learn(12).save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model", env=env(copies))
+    assert loaded.learn(12, reset_num_timesteps=False).num_timesteps == 24
+
+
+def test_numbers_are_drawn_evenly_before_the_first_update():
+    model = learner(JointVecEnv(make_team_env(BoxTeam, n_envs=2)), learning_starts=400, exploration_noise=1e-6)
+    model.learn(400)
+    # It has come round
+    actions = model.replay_buffer.actions
+    spread = actions.std(axis=(0, 1))
+    assert spread[spread > 0].min() > 0.5 and abs(actions).max() > 0.95

@@ -168,7 +168,8 @@ def test_learns_acts_and_is_saved(recurrent, tmp_path):
     assert loaded.num_timesteps == 60
 
 
-@pytest.mark.parametrize("at", [8, 32])
+# After 10 and 34 steps the next one ends an episode
+@pytest.mark.parametrize("at", [8, 10, 32, 34])
 def test_a_resumed_training_is_the_undisturbed_one(at):
     def make_env():
         return joint_team(make_team_env(CountingTeam, n_envs=2, seed=0))
@@ -195,3 +196,24 @@ def test_roles_of_levers_are_found_before_anything_is_won():
     own = {"n_roles": 2, "recurrent": False}
     model = RODE("RodePolicy", env, role_start=4000, learning_rate=2e-3, seed=0, policy_kwargs=own).learn(4000)
     assert model.policy.role_actions.tolist() == [[True] * 3 + [False] * 3, [False] * 3 + [True] * 3]
+
+
+def test_steps_that_are_counted_anew_give_no_probability_above_one():
+    model = with_roles()
+    model.learn(4)
+    assert model.exploration_rate == 1.0
+
+
+def test_the_schedule_of_the_learning_rate_holds_for_the_effects():
+    model = learner(learning_rate=lambda left: 1e-3 * left, role_start=1000)
+    model.learn(48)
+    rates = [group["lr"] for optimizer in model._optimizers for group in optimizer.param_groups]
+    assert len(rates) == 2 and rates[0] == rates[1] < 1e-4
+
+
+def test_roles_wait_for_embeddings_that_have_been_trained():
+    model = learner(batch_size=8, role_start=6)
+    model.learn(12)
+    assert not model._n_updates and not model.policy.has_roles
+    model.learn(60, reset_num_timesteps=False)
+    assert model._n_updates and model.policy.has_roles
