@@ -91,6 +91,7 @@ class BeliefNetworksMixin(_Policy):
         **kwargs: Any,
     ) -> None:
         # Before SB3's constructor, which builds the networks
+        self.others_baseline = None
         self.options = BeliefOptions(
             belief=belief,
             history_length=history_length,
@@ -157,7 +158,6 @@ class BeliefNetworksMixin(_Policy):
         return BeliefExtractor(self.observation_space, features, belief, options, given)
 
     def _build_mlp_extractor(self) -> None:
-        self.others_baseline = None
         if not self.has_belief:
             super()._build_mlp_extractor()
             return
@@ -170,13 +170,13 @@ class BeliefNetworksMixin(_Policy):
             self.fusion_activation_fn,
             self.device,
         )
-        if self.options.critic_sees_others:
-            seen = self.layout.width + self.layout.n_others
-            with th.random.fork_rng(devices=[]):
-                # As above
-                self.others_baseline = OthersBaseline(self.features_extractor.features_dim, seen, self.device)
 
     def _build(self, lr_schedule: Schedule) -> None:
+        if self.options.critic_sees_others and self.has_belief:
+            seen = self.layout.width + self.layout.n_others
+            with th.random.fork_rng(devices=[]):
+                # As the belief's; before the optimizer is made
+                self.others_baseline = OthersBaseline(self.features_extractor.features_dim, seen, self.device)
         super()._build(lr_schedule)
         if isinstance(self.features_extractor, BeliefExtractor):
             # A network of the user's own takes one tensor, as wide as features_dim says

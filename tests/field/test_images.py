@@ -112,7 +112,8 @@ def made(algorithm, n_steps, monkeypatch, **policy_kwargs):
         raise Enough
 
     # SB3's own, in which networks and buffers are made
-    monkeypatch.setattr(algorithm.__mro__[2], "_setup_model", stop)
+    stock = next(kind for kind in algorithm.__mro__ if kind.__module__.startswith(("stable_baselines3.", "sb3_contrib.")))
+    monkeypatch.setattr(stock, "_setup_model", stop)
     with pytest.raises(Enough):
         algorithm("BeliefPolicy", env, n_steps=n_steps, policy_kwargs=policy_kwargs)
 
