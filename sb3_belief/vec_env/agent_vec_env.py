@@ -293,7 +293,12 @@ class TransitionSplitter:
         for i, agent in enumerate(self._agents):
             ends = {
                 int(env_idx): self._end(
-                    i, int(env_idx), row_of(obs[agent], int(env_idx)), bool(cut[env_idx, i]), infos[env_idx], present
+                    i,
+                    int(env_idx),
+                    row_of(obs[agent], int(env_idx)),
+                    bool(cut[env_idx, i]),
+                    infos[env_idx],
+                    None if team_dones[env_idx] else present,
                 )
                 for env_idx in (np.flatnonzero(dones[:, i]) if any_done else ())
             }

@@ -1,6 +1,7 @@
 """What each agent gets of a joint step."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,6 +115,24 @@ def test_an_inactive_slot_is_not_bootstrapped():
     obs = {"a": np.zeros((1, 1)), "b": np.zeros((1, 1))}
     a, b = splitter.split(actions, (obs, np.zeros(1), np.ones(1, bool), [info]))
     assert a[3][0]["TimeLimit.truncated"] is False and b[3][0]["TimeLimit.truncated"] is True
+
+
+def test_masks_of_the_next_episode_are_not_those_of_an_end():
+    """Where an environment does not say its last masks, the present ones are of that episode only if the team plays on."""
+    splitter = TransitionSplitter(["a"], {"a": spaces.Discrete(2)})
+    info = {
+        "agent_rewards": np.zeros(1, np.float32),
+        "visible": np.zeros((1, 0), bool),
+        "active": np.ones(1, bool),
+        "life_end": np.ones(1, bool),
+        "truncated": np.zeros(1, bool),
+    }
+    ends = {**info, "terminal_observation": {"a": np.zeros(1)}, "episode": {"r": 0.0}, "agent_episode_rewards": np.zeros(1)}
+    step: Any = ({"a": np.zeros((2, 1))}, np.zeros(2), np.array([True, False]), [ends, info])
+    masks = {"a": np.array([[True, False], [False, True]])}
+    (transition,) = splitter.transitions({"a": np.zeros(2, int)}, step, lambda: masks)
+    ended, lives_on = transition.as_step()[3]
+    assert "terminal_action_masks" not in ended and lives_on["terminal_action_masks"].tolist() == [False, True]
 
 
 def test_transitions_share_no_memory():
