@@ -114,7 +114,7 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
     for contender in contenders:
         for entry in entries:
             with _meetings(contender, entry, options) as meetings:
-                if contender.role == TEAM and not any(meeting.observers for _, meeting in meetings):
+                if contender.role == TEAM and not any(meeting.can_adapt for _, meeting in meetings):
                     raise ConfigError(_without_history(contender, meetings[0][1]))
     rows: list[dict[str, Any]] = []
     for number, entry in enumerate(entries, start=1):
@@ -153,8 +153,9 @@ def _number(given: str | None) -> float | None:
 def _without_history(contender: _Contender, meeting: Meeting) -> str:
     found = ", ".join(f"{agent}: {type(meeting.team.agents[agent]).__name__}" for agent in meeting.agents)
     return (
-        f"{_COMMAND}: nobody in {str(contender.path)!r} has a belief that a history feeds, so observing changes nothing for"
-        f" them ({found}). Give it as --blind to a team that has: belief='adaptive', 'dynamic' or 'context'."
+        f"{_COMMAND}: nobody in {str(contender.path)!r} has a belief that a history feeds, or a recurrent state that lasts"
+        f" over episodes, so observing changes nothing for them ({found}). Give it as --blind to a team that has:"
+        " belief='adaptive', 'dynamic' or 'context', or memory_span='partner'."
     )
 
 

@@ -76,8 +76,8 @@ def crossplay(options: CrossplayOptions) -> tuple[Path, str]:
             for other, others in zip(_names(options.runs), teams, strict=True):
                 for agent in chosen:
                     meeting = Meeting(team, [agent], Among(team, agent, others), env, observed_env)
-                    # Of who has no history nothing can change
-                    steps = (0, options.steps) if meeting.observers and options.steps else (0,)
+                    # Of who remembers nothing of earlier episodes nothing can change
+                    steps = (0, options.steps) if meeting.can_adapt and options.steps else (0,)
                     rows += _measured(meeting, steps, play, shown.env_id, name, other)
             print(f"{name}: met {len(teams)} teams", flush=True)
     if len({row["steps"] for row in rows}) > 1:

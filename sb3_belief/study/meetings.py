@@ -12,8 +12,10 @@ from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team import Team, TeamVecEnv, observing
 from sb3_belief.team.agent_models import env_seed
+from sb3_belief.team.recurrent import PartnerRecurrentPPO
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts
+from sb3_belief.vec_env.observe_last import MEMORY_START
 from sb3_belief.zoo.errors import RunFailed
 from sb3_belief.zoo.evaluate import Outcome, evaluate
 
@@ -147,26 +149,39 @@ class Meeting:
         """Those of the agents that have a belief which a history feeds."""
         return [agent for agent in self.agents if has_history(self.team.agents[agent].policy)]
 
-    def measure(self, play: Play, repetition: int) -> Measured:
+    @property
+    def rememberers(self) -> list[str]:
+        """Those of the agents whose recurrent state lasts over episodes."""
+        return [agent for agent in self.agents if isinstance(self.team.agents[agent], PartnerRecurrentPPO)]
+
+    @property
+    def can_adapt(self) -> bool:
+        """Whether one of the agents remembers anything of earlier episodes."""
+        return bool(self.observers or self.rememberers)
+
+    def measure(self, play: Play, repetition: int, memory: Mapping[str, Any] | None = None) -> Measured:
         """
         Evaluate with memories as they are, and without observing.
 
         :param play: How
         :param repetition: Number of the repetition
+        :param memory: Recurrent states of one copy by agent, with which all copies begin; for agents whose state lasts over
+            episodes. None for empty ones
         :return: What was found
         """
-        seed = play.episodes_seed(repetition)
-        witness = _Witness(self.env, self.team, self.agents, self.told)
+        seed, memory = play.episodes_seed(repetition), memory or {}
+        witness = _Witness(self.env, self.team, self.agents, self.told, memory)
         self.env.seed(seed)
         with RngSwitch(RngState(seed)):
-            outcome = evaluate(self.model, witness, play.episodes, play.deterministic)
+            outcome = evaluate(_Remembering(self.model, memory, self.env.num_envs), witness, play.episodes, play.deterministic)
         return Measured(outcome, *witness.accuracy())
 
     def adapt(self, checkpoints: Sequence[int], play: Play, repetition: int) -> dict[int, Measured]:
         """
         Measure after each of several numbers of steps that the agents have observed, from their saved histories on.
 
-        Afterwards the histories are as before. Agents without one play as many steps all the same.
+        Afterwards the histories are as before. Recurrent states that last over episodes are empty at first, since none is
+        saved with a model. Agents that have neither play as many steps all the same.
 
         :param checkpoints: The numbers, ascending
         :param play: How
@@ -184,7 +199,7 @@ class Meeting:
             player = _Player(self.model, env, play.deterministic, seed, self.told)
             for steps in checkpoints:
                 player.go_on(steps)
-                found[steps] = self.measure(play, repetition)
+                found[steps] = self.measure(play, repetition, player.memory(self.rememberers))
         return found
 
 
@@ -195,6 +210,24 @@ def has_history(policy: Any) -> bool:
     :param policy: Of an agent
     """
     return isinstance(policy, BeliefPolicyMixin) and policy.history is not None
+
+
+class _Remembering:
+    """Acts like a model whose agents remember something when the episodes begin."""
+
+    def __init__(self, model: Any, memory: Mapping[str, Any], n_envs: int):
+        self._model = model
+        # [n_layers, 1, n_hidden] each
+        copies = {agent: tuple(np.repeat(part, n_envs, axis=1) for part in state) for agent, state in memory.items()}
+        own = copies or None
+        self._first: Any = (own, None) if own and isinstance(model, Among) else own
+
+    @property
+    def takes_masks(self) -> bool:
+        return self._model.takes_masks
+
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return self._model.predict(observation, self._first if state is None else state, *args, **kwargs)
 
 
 class _Player:
@@ -212,6 +245,15 @@ class _Player:
         """Return how many steps each observer has observed at least; those played if nobody observes."""
         observed: Mapping[str, int] | None = getattr(self._env, "steps", None)
         return min(observed.values()) if observed is not None else self._played
+
+    def memory(self, agents: Sequence[str]) -> dict[str, Any]:
+        """
+        Return the recurrent states of some agents, of those that have one by now.
+
+        :param agents: Their names
+        """
+        own = self._state[0] if isinstance(self._model, Among) and self._state else self._state
+        return {agent: own[agent] for agent in agents if own and own[agent] is not None}
 
     def go_on(self, steps: int) -> None:
         """
@@ -246,8 +288,9 @@ class _Player:
 class _Witness(VecEnvWrapper):
     """Keeps what agents that predict others see of an evaluation, whose memories stay as they are meanwhile."""
 
-    def __init__(self, env: TeamVecEnv, team: Team, agents: Collection[str], told: set[str]):
+    def __init__(self, env: TeamVecEnv, team: Team, agents: Collection[str], told: set[str], rememberers: Collection[str]):
         super().__init__(env)
+        self._rememberers = rememberers
         acted: Any = env.action_space
         self._names, self._told = env.possible_agents, told
         actions = {agent: acted[agent] for agent in env.possible_agents}
@@ -262,6 +305,9 @@ class _Witness(VecEnvWrapper):
 
     def reset(self) -> Any:
         self._obs = self.venv.reset()
+        for agent in self._rememberers:
+            # To these agents the partner is not a new one
+            self._obs[agent][MEMORY_START][:] = 0
         return self._obs
 
     def step_async(self, actions: np.ndarray) -> None:

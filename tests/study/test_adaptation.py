@@ -62,11 +62,11 @@ def test_steps_are_counted_and_nothing_else_changes(teams, tmp_path, monkeypatch
         remembered.append(len(actions))
         remember(policy, observations, actions, **kwargs)
 
-    def spied(meeting, play, repetition):
+    def spied(meeting, play, repetition, memory=None):
         weights = {name: value.detach().clone() for name, value in meeting.team.agents["car_1"].policy.named_parameters()}
         before = meeting.team.agents["car_1"].policy.history
         n_before = sum(remembered)
-        measured = measure(meeting, play, repetition)
+        measured = measure(meeting, play, repetition, memory)
         # An evaluation remembers nothing
         assert sum(remembered) == n_before and meeting.team.agents["car_1"].policy.history[0] is before[0]
         states.append((n_before, before, weights))
