@@ -10,10 +10,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_belief.common.checks import check_integer, check_share
 from sb3_belief.references.coma_policy import ComaPolicy, coma_actor_loss, counterfactual_advantages, taken
-from sb3_belief.references.joint_vec_env import check_joint_env, refuse_normalisation
+from sb3_belief.references.joint_learner import JointLearnerMixin
 
 
-class COMA(OnPolicyAlgorithm):
+class COMA(JointLearnerMixin, OnPolicyAlgorithm):
     """
     COMA (Foerster et al. 2018): actors of their own for the agents, trained by a critic that sees the state and all actions.
 
@@ -43,6 +43,7 @@ class COMA(OnPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ComaPolicy": ComaPolicy}
+    optimizer_names = ("optimizer", "critic_optimizer")
     policy: ComaPolicy  # type: ignore[assignment]
 
     def __init__(
@@ -70,8 +71,7 @@ class COMA(OnPolicyAlgorithm):
         check_share("td_lambda", td_lambda, "0 for one-step targets, 1 for whole returns")
         if ent_coef < 0:
             raise ValueError(f"ent_coef={ent_coef!r} must be at least 0: the weight of the entropy.")
-        if env is not None:
-            check_joint_env(env, type(self).__name__)
+        self._check_joint_env(env)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,  # type: ignore[arg-type]
@@ -100,10 +100,6 @@ class COMA(OnPolicyAlgorithm):
         self._in_play: list[np.ndarray] = []
         if _init_setup_model:
             self._setup_model()
-
-    def _setup_model(self) -> None:
-        refuse_normalisation(self)
-        super()._setup_model()
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
         self._in_play = []
@@ -158,11 +154,6 @@ class COMA(OnPolicyAlgorithm):
             policy.critic_target.load_state_dict(policy.critic.state_dict())
         return loss.item()
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, type(self).__name__)
-        super().set_env(env, force_reset)
-        refuse_normalisation(self)
-
     def learn(
         self,
         total_timesteps: int,
@@ -174,6 +165,3 @@ class COMA(OnPolicyAlgorithm):
     ) -> "COMA":
         """Learn as SB3's algorithms do. The arguments are those of A2C's ``learn``."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "policy.critic_optimizer"], []

@@ -14,10 +14,10 @@ from sb3_belief.common.checks import check_integer, check_share
 from sb3_belief.references.agent_net import AgentValues
 from sb3_belief.references.episodes import EpisodeBatch, EpisodeReplayBuffer, lambda_returns
 from sb3_belief.references.factorised_policy import MIXERS, FactorisedPolicy
-from sb3_belief.references.joint_vec_env import check_joint_env, refuse_normalisation
+from sb3_belief.references.joint_learner import JointLearnerMixin
 
 
-class ValueFactorisation(OffPolicyAlgorithm):
+class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
     """
     Deep Q-learning of a joint value that is made of each agent's own: VDN (Sunehag et al. 2018), QMIX (Rashid et al. 2018),
     QPLEX (Wang et al. 2021), QTRAN-base (Son et al. 2019). It uses the global state in training; the agents act without it.
@@ -91,8 +91,7 @@ class ValueFactorisation(OffPolicyAlgorithm):
         check_share("td_lambda", td_lambda, "0 for one-step targets, 1 for whole returns")
         check_share("exploration_initial_eps", exploration_initial_eps, "the probability of a random action")
         check_share("exploration_final_eps", exploration_final_eps, "the probability of a random action")
-        if env is not None:
-            check_joint_env(env, type(self).__name__)
+        self._check_joint_env(env)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -244,15 +243,6 @@ class ValueFactorisation(OffPolicyAlgorithm):
             self._last_states = None
         return result
 
-    def _setup_model(self) -> None:
-        refuse_normalisation(self)
-        super()._setup_model()
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, type(self).__name__)
-        super().set_env(env, force_reset)
-        refuse_normalisation(self)
-
     def learn(
         self,
         total_timesteps: int,
@@ -264,6 +254,3 @@ class ValueFactorisation(OffPolicyAlgorithm):
     ) -> "ValueFactorisation":
         """Learn as SB3's algorithms do. The arguments are those of DQN's ``learn``."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []

@@ -5,9 +5,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
@@ -167,42 +165,6 @@ class JointVecEnv(VecEnvWrapper):
                 joint["mask"][:, i, : int(actions.n)] = legal
             joint["mask"][..., 0] |= ~joint["mask"].any(axis=-1)
         return joint
-
-
-def check_joint_env(
-    env: GymEnv | str, learner: str, actions: tuple[type[spaces.Space], ...] = (spaces.MultiDiscrete,)
-) -> None:
-    """
-    Check that a joint learner can learn in an environment.
-
-    :param env: What the user gave
-    :param learner: What it is called
-    :param actions: The kinds of joint actions that the learner chooses
-    :raises ValueError: If it cannot, with what it needs
-    """
-    observed = getattr(env, "observation_space", None)
-    if not isinstance(observed, spaces.Dict) or not {"obs", "state", "active"} <= observed.spaces.keys():
-        raise ValueError(
-            f"{learner} learns in a team's environment shown as one: JointVecEnv(make_team_env(...)) of"
-            f" sb3_belief.references.joint_vec_env, not in {env!r}."
-        )
-    joint = getattr(env, "action_space", None)
-    if not isinstance(joint, actions):
-        raise ValueError(f"{learner} needs agents with Discrete actions, and those of this environment are Box: {joint}.")
-
-
-def refuse_normalisation(model: BaseAlgorithm) -> None:
-    """
-    Check that a joint learner is not given normalised observations.
-
-    :param model: The learner
-    :raises ValueError: If its environment normalises
-    """
-    if model.get_vec_normalize_env() is not None:
-        raise ValueError(
-            f"{type(model).__name__} does not take normalised observations, since masks and states are among them: leave"
-            " normalize out."
-        )
 
 
 def _one_row(part: Any) -> np.ndarray:

@@ -13,14 +13,12 @@ from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_belief.common.checks import check_integer, check_share
+from sb3_belief.references.joint_learner import JointLearnerMixin
 from sb3_belief.references.joint_replay import JointReplayBuffer, JointSamples
-from sb3_belief.references.joint_vec_env import check_joint_env, refuse_normalisation
 from sb3_belief.references.maddpg_policy import MaddpgPolicy, maddpg_actor_loss
 
-_ACTIONS = (spaces.MultiDiscrete, spaces.Box)
 
-
-class MADDPG(OffPolicyAlgorithm):
+class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
     """
     MADDPG (Lowe et al. 2017): for each agent an actor of its own, and a critic that sees the state and all actions.
 
@@ -54,6 +52,8 @@ class MADDPG(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MaddpgPolicy": MaddpgPolicy}
+    joint_actions = (spaces.MultiDiscrete, spaces.Box)
+    optimizer_names = ("optimizer", "critic_optimizer")
     policy: MaddpgPolicy
 
     def __init__(
@@ -86,8 +86,7 @@ class MADDPG(OffPolicyAlgorithm):
         for name, value in (("exploration_noise", exploration_noise), ("output_coef", output_coef)):
             if value < 0:
                 raise ValueError(f"{name}={value!r} must be at least 0.")
-        if env is not None:
-            check_joint_env(env, type(self).__name__, _ACTIONS)
+        self._check_joint_env(env)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -114,7 +113,6 @@ class MADDPG(OffPolicyAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        refuse_normalisation(self)
         if isinstance(self.action_space, spaces.Box):
             # Anew also for a model that is loaded, whose noise was for as many copies as it had; it has no memory
             shape = self.action_space.shape
@@ -204,11 +202,6 @@ class MADDPG(OffPolicyAlgorithm):
             gradient.mul_((self.max_grad_norm / (norms + 1e-6)).clamp(max=1.0)[:, None, None])
         optimizer.step()
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        check_joint_env(env, type(self).__name__, _ACTIONS)
-        super().set_env(env, force_reset)
-        refuse_normalisation(self)
-
     def learn(
         self,
         total_timesteps: int,
@@ -220,6 +213,3 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> "MADDPG":
         """Learn as SB3's algorithms do. The arguments are those of TD3's ``learn``."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "policy.critic_optimizer"], []

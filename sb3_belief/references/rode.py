@@ -49,6 +49,7 @@ class RODE(ValueFactorisation):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"RodePolicy": RodePolicy}
+    optimizer_names = ("optimizer", "effects_optimizer")
     policy: RodePolicy
 
     def __init__(
@@ -215,6 +216,3 @@ class RODE(ValueFactorisation):
         :return: ``[B, T]``
         """
         return self.role_targets(batch)[1]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "policy.effects_optimizer"], []

@@ -8,7 +8,8 @@ from gymnasium import spaces
 from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_belief.references.joint_vec_env import JointVecEnv, check_joint_env
+from sb3_belief.references.joint_learner import check_joint_env
+from sb3_belief.references.joint_vec_env import JointVecEnv
 from sb3_belief.team import make_team_env
 from tests.references.counting_team import CountingTeam, joint_env
 
