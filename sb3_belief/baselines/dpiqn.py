@@ -18,7 +18,7 @@ from sb3_belief.baselines.inference_networks import (
 from sb3_belief.baselines.iql import IQL
 from sb3_belief.baselines.others_replay import OthersDictReplayBuffer, OthersReplayBuffer, OthersReplayMixin
 from sb3_belief.belief_ppo.buffers import read_others
-from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
+from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, check_same_others, others_of
 
 SelfDPIQN = TypeVar("SelfDPIQN", bound="DPIQN")
 
@@ -93,12 +93,7 @@ class DPIQN(IQL):
         return others
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        found = others_of(self._wrap_env(env, verbose=0))
-        if list(found.items()) != list(self.others_action_spaces.items()):
-            raise ValueError(
-                f"The others of this environment are {found}, but the model has been made for {self.others_action_spaces}: it"
-                " predicts these others, in this order."
-            )
+        check_same_others(self._wrap_env(env, verbose=0), self.others_action_spaces)
         super().set_env(env, force_reset)
 
     def _store_transition(

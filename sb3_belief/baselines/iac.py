@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -220,7 +221,7 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
         rollout_buffer.has_masks = self._has_masks(env)
         if rollout_buffer.has_masks:
             self.learned_with_masks = True
-            self.policy.read_masks = partial(_masks_of, env)
+            self.policy.read_masks = partial(get_action_masks, env)
         try:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:
@@ -259,7 +260,3 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
     ) -> "IAC":
         """Learn as A2C does. The arguments are those of A2C's ``learn``."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-
-def _masks_of(env: VecEnv) -> np.ndarray:
-    return np.stack(env.env_method("action_masks"))

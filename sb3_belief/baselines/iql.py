@@ -5,6 +5,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -149,7 +150,7 @@ class IQL(DQN):
         if not self.env.has_attr("action_masks"):
             return None
         self.learned_with_masks = True
-        return np.stack(self.env.env_method("action_masks"))
+        return get_action_masks(self.env)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

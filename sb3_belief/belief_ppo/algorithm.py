@@ -27,7 +27,7 @@ from sb3_belief.belief_ppo.extractor import fitting_extractor, rollout_rows
 from sb3_belief.belief_ppo.memory import holds_images, warn_of_memory
 from sb3_belief.belief_ppo.on_policy_details import DetailsAlgorithmMixin
 from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptions
-from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, others_of
+from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, check_same_others, others_of
 from sb3_belief.belief_ppo.others_baseline import take_off
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from sb3_belief.common.safe_files.models import add_plain_data, load_model_zip, read_model, write_model
@@ -180,14 +180,8 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
         )
 
     def _check_others(self, env: VecEnv) -> None:
-        if self.belief == "none":
-            return
-        found = others_of(env)
-        if list(found.items()) != list(self.others_action_spaces.items()):
-            raise ValueError(
-                f"the others of this environment are {found}, but the model has been made for {self.others_action_spaces}; "
-                "a belief is about these others with these action spaces, in this order"
-            )
+        if self.belief != "none":
+            check_same_others(env, self.others_action_spaces)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         refuse_many_agents(env, type(self).__name__)

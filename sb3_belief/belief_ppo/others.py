@@ -118,3 +118,19 @@ def others_of(env: VecEnv) -> ActionSpaces:
     """
     # Asked first, because a worker process does not survive being asked for an attribute that it does not have
     return dict(env.get_attr("others_action_spaces")[0]) if env.has_attr("others_action_spaces") else {}
+
+
+def check_same_others(env: VecEnv, others_action_spaces: ActionSpaces) -> None:
+    """
+    Check that an environment has the others that a model has been made for.
+
+    :param env: The vectorised environment of one agent
+    :param others_action_spaces: The others' action spaces that the model knows, in order
+    :raises ValueError: If it has others, or the same in another order or with other action spaces
+    """
+    found = others_of(env)
+    if list(found.items()) != list(others_action_spaces.items()):
+        raise ValueError(
+            f"The others of this environment are {found}, but the model has been made for {others_action_spaces}: it predicts"
+            " these others with these action spaces, in this order."
+        )
