@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import A2C
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -21,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.belief_ppo.active_steps import ActiveStepsAlgorithmMixin, ActiveStepsBufferMixin
 from sb3_belief.belief_ppo.algorithm import refuse_many_agents
 from sb3_belief.belief_ppo.buffers import attach, attached
-from sb3_belief.vec_env.action_masks import mask_width
+from sb3_belief.vec_env.action_masks import env_masks, mask_width
 
 # As sb3-contrib has it: a logit of no probability, whose entropy is finite
 _IMPOSSIBLE = -1e8
@@ -221,7 +220,7 @@ class IAC(ActiveStepsAlgorithmMixin, A2C):
         rollout_buffer.has_masks = self._has_masks(env)
         if rollout_buffer.has_masks:
             self.learned_with_masks = True
-            self.policy.read_masks = partial(get_action_masks, env)
+            self.policy.read_masks = partial(env_masks, env)
         try:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:

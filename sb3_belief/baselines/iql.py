@@ -5,7 +5,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -15,6 +14,7 @@ from stable_baselines3.dqn.dqn import DQN
 
 from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
 from sb3_belief.baselines.q_networks import MaskedQCnnPolicy, MaskedQMultiInputPolicy, MaskedQPolicy
+from sb3_belief.vec_env.action_masks import env_masks
 
 SelfIQL = TypeVar("SelfIQL", bound="IQL")
 
@@ -150,7 +150,7 @@ class IQL(DQN):
         if not self.env.has_attr("action_masks"):
             return None
         self.learned_with_masks = True
-        return get_action_masks(self.env)
+        return env_masks(self.env)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 
 def mask_parts(space: spaces.Space) -> list[int]:
@@ -124,3 +125,15 @@ def sample_action(space: spaces.Space, mask: np.ndarray | None, rng: np.random.G
     # Bounds may be infinite, and a uniform draw needs finite ones
     low, high = np.maximum(space.low, -1e3), np.minimum(space.high, 1e3)
     return rng.uniform(low, high).astype(space.dtype)
+
+
+def env_masks(env: VecEnv) -> np.ndarray:
+    """
+    Return which actions are possible now in the environment of one agent.
+
+    It is ``get_action_masks`` of sb3-contrib, for agents that are deployed without that package.
+
+    :param env: An environment whose copies have ``action_masks()``
+    :return: bool ``[n_envs, k]``
+    """
+    return np.stack(env.env_method("action_masks"))

@@ -54,8 +54,9 @@ def falling(progress):
     return 1e-2 * progress
 
 
-def toy_team(algo, jobs, env_id=ToyEnv, policy="MlpPolicy", n_envs=2, **kwargs):
-    return Team(algo, policy, make_team_env(env_id, n_envs=n_envs), seed=0, **{"device": "cpu", "jobs": jobs, **kwargs})
+def toy_team(algo, jobs, env_id=ToyEnv, policy="MlpPolicy", n_envs=2, observe_last=False, **kwargs):
+    env = make_team_env(env_id, n_envs=n_envs, observe_last=observe_last)
+    return Team(algo, policy, env, seed=0, **{"device": "cpu", "jobs": jobs, **kwargs})
 
 
 def flat(value):
@@ -110,7 +111,8 @@ CASES: dict[str, tuple[Any, dict[str, Any]]] = {
     "ppo": (PPO, {**PPO_SMALL, "learning_rate": falling, "target_kl": 1e-3, "clip_range_vf": 0.2}),
     "a2c": (A2C, {"n_steps": 8}),
     "maskable_ppo": (MaskablePPO, {**PPO_SMALL, "env_id": EASY}),
-    "recurrent_ppo": (RecurrentPPO, {**PPO_SMALL, "policy": "MlpLstmPolicy"}),
+    # Its observations hold the last step too, which is made of what all agents did
+    "recurrent_ppo": (RecurrentPPO, {**PPO_SMALL, "policy": "MlpLstmPolicy", "observe_last": True}),
     "trpo": (TRPO, {"n_steps": 8, "batch_size": 16}),
     "belief_ppo": (
         BeliefPPO,
