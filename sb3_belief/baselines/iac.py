@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_belief.belief_ppo.active_steps import ActiveStepsAlgorithmMixin, ActiveStepsBufferMixin
 from sb3_belief.belief_ppo.algorithm import refuse_many_agents
 from sb3_belief.belief_ppo.buffers import attach, attached
-from sb3_belief.vec_env.action_masks import env_masks, mask_width
+from sb3_belief.common.action_masks import env_masks, mask_width
 
 # As sb3-contrib has it: a logit of no probability, whose entropy is finite
 _IMPOSSIBLE = -1e8

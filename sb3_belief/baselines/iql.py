@@ -14,7 +14,7 @@ from stable_baselines3.dqn.dqn import DQN
 
 from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
 from sb3_belief.baselines.q_networks import MaskedQCnnPolicy, MaskedQMultiInputPolicy, MaskedQPolicy
-from sb3_belief.vec_env.action_masks import env_masks
+from sb3_belief.common.action_masks import env_masks
 
 SelfIQL = TypeVar("SelfIQL", bound="IQL")
 

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_belief.vec_env.action_masks import first_actions, flat_mask, mask_parts, mask_width, sample_action
+from sb3_belief.common.action_masks import first_actions, flat_mask, mask_parts, mask_width, sample_action
 from sb3_belief.vec_env.observation_forms import as_bytes
 from sb3_belief.vec_env.returned import ALL, plain_ends, plain_infos, plain_reset, plain_step
 from sb3_belief.vec_env.scripted_others import ScriptedOthers, optional_member

@@ -9,9 +9,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_belief.common.action_masks import mask_width
 from sb3_belief.references.one_learner import OneLearnerVecEnv
 from sb3_belief.references.with_state import WithAgentId, WithState, one_row
-from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts, row_of
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamVecEnv

@@ -10,10 +10,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.belief_ppo import BeliefPPO
+from sb3_belief.common.action_masks import mask_parts
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.team.model_parts import shown_space
 from sb3_belief.team.predictor import takes_masks
-from sb3_belief.vec_env.action_masks import mask_parts
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 # An agent that is not masked chooses what is impossible within its first random actions, or hardly ever

@@ -8,9 +8,9 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.common.action_masks import sample_action
 from sb3_belief.envs.env_util import make_team_env
 from sb3_belief.team.team import Team
-from sb3_belief.vec_env.action_masks import sample_action
 
 # Enough for two rollouts of two copies, an update, and a belief with a history
 _SMALL: dict[str, Any] = {

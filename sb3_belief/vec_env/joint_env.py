@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief.common.action_masks import mask_row, mask_width, wrong_width
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
-from sb3_belief.vec_env.action_masks import mask_row, mask_width, wrong_width
 from sb3_belief.vec_env.copy_state import CopyState
 from sb3_belief.vec_env.events import Events, Flags, StepRecord, find_events, no_flags
 from sb3_belief.vec_env.observation_forms import ObservationForms, copied, has_parts, map_parts, zeros_in

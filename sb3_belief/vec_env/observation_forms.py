@@ -14,7 +14,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from torch import nn
 
-from sb3_belief.vec_env.action_masks import mask_row, mask_width
+from sb3_belief.common.action_masks import mask_row, mask_width
 from sb3_belief.vec_env.scripted_others import optional_member
 
 MASK = "action_mask"

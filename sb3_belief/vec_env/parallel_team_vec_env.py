@@ -11,9 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_belief.common.action_masks import mask_width
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
-from sb3_belief.vec_env.action_masks import mask_width
 from sb3_belief.vec_env.joint_env import STATE, JointEnv, step_and_reset
 from sb3_belief.vec_env.observation_forms import ObservationStack
 from sb3_belief.vec_env.restarts import LastStep, Restarts, cut_step

@@ -6,7 +6,7 @@ from typing import Any, NoReturn
 import numpy as np
 from gymnasium import spaces
 
-from sb3_belief.vec_env.action_masks import mask_parts
+from sb3_belief.common.action_masks import mask_parts
 from sb3_belief.vec_env.observation_forms import parts_of
 from sb3_belief.vec_env.validation import n_choices, not_a_choice, not_finite, place
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_belief.vec_env.action_masks import mask_width
+from sb3_belief.common.action_masks import mask_width
 from sb3_belief.vec_env.events import StepRecord
 from sb3_belief.vec_env.observation_forms import parts_of
 

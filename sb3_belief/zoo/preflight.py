@@ -16,8 +16,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
+from sb3_belief.common.action_masks import sample_action
 from sb3_belief.team import TeamVecEnv
-from sb3_belief.vec_env.action_masks import sample_action
 from sb3_belief.zoo.config import AgentConfig, RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short, shorten
 

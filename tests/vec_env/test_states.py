@@ -8,9 +8,9 @@ from gymnasium import spaces
 from stable_baselines3 import DQN
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.common.action_masks import sample_action
 from sb3_belief.envs import check_team_env
 from sb3_belief.team.partners.vec_env import PartnersVecEnv
-from sb3_belief.vec_env.action_masks import sample_action
 from tests.team.helpers import Team, make_team_env, parameters
 from tests.team.toy_envs import FaultyEnv, MaskedEnv, ScriptedEnv, ToyEnv
 

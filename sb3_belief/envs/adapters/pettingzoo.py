@@ -12,8 +12,8 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import aec_to_parallel, aec_to_parallel_wrapper, turn_based_aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import BaseParallelWrapper, BaseWrapper
 
+from sb3_belief.common.action_masks import first_actions
 from sb3_belief.envs.suites import unknown_name
-from sb3_belief.vec_env.action_masks import first_actions
 from sb3_belief.vec_env.observation_forms import ObservationForms
 from sb3_belief.vec_env.user_env import UserEnv
 
