@@ -2,6 +2,7 @@
 # mypy: disable-error-code="arg-type, operator"
 
 import io
+import itertools
 
 import numpy as np
 import pytest
@@ -132,6 +133,38 @@ def test_returns_of_roles_by_hand():
         assert of_roles[0, 2].item() == pytest.approx((rewards[2] + gamma * rewards[3] + gamma**2 * joint[4]).item(), rel=1e-4)
         last = rewards[4] + (gamma * joint[5] if truncates else 0)
         assert of_roles[0, 4].item() == pytest.approx(last.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("length", [4, 5])
+def test_targets_of_actions_by_hand(length):
+    """The next step's actions are those of its role: the one that was chosen; after a cut the one that would have been."""
+    env = joint_env(n_envs=8, truncates=True, length=length)
+    model = with_roles(env=env, batch_size=2, role_start=1, learning_rate=0.0, policy_kwargs={"recurrent": False})
+    model.learn(8 * length)
+    batch, policy = model.replay_buffer.batch(model.replay_buffer.episodes[:8]), model.policy
+    # So that double Q differs from taking the target network's best
+    with th.no_grad():
+        for parameter in policy.target_net.parameters():
+            parameter.add_(th.randn_like(parameter))
+    _, found = model.role_targets(batch)
+    role_values, features = policy.pass_episodes(policy.net, batch)
+    _, target_features = policy.pass_episodes(policy.target_net, batch)
+    differ = {"role": False, "action": False}
+    for episode, t in itertools.product(range(8), range(length)):
+        after, kept = slice(t + 1, t + 2), batch.actions[episode, t, :, 1]
+        if t + 1 < length:
+            role = batch.actions[episode, t + 1, :, 1]
+        else:
+            # A role is kept for two steps: after four of them another would be chosen, after five not yet
+            role = role_values[episode, length].argmax(dim=-1) if length == 4 else kept
+            differ["role"] |= bool((role != kept).any())
+        parts = role[None], batch.mask[episode, after], batch.state[episode, after]
+        of_target = policy.values_in(policy.target_net, target_features[episode, after], *parts)
+        best = policy.values_in(policy.net, features[episode, after], *parts).greedy()
+        differ["action"] |= bool((best != of_target.greedy()).any())
+        value = policy.target_net.action_mixer.joint_value(of_target, best).squeeze()
+        assert found[episode, t].item() == pytest.approx((batch.rewards[episode, t] + 0.99 * value).item(), rel=1e-4)
+    assert differ == {"role": length == 4, "action": True}
 
 
 def test_only_the_right_targets_move():
