@@ -21,6 +21,7 @@ from sb3_belief.belief_ppo.active_steps import ActiveStepsAlgorithmMixin, Active
 from sb3_belief.belief_ppo.algorithm import refuse_many_agents
 from sb3_belief.belief_ppo.buffers import attach, attached
 from sb3_belief.common.action_masks import env_masks, mask_width
+from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 # As sb3-contrib has it: a logit of no probability, whose entropy is finite
 _IMPOSSIBLE = -1e8
@@ -151,7 +152,7 @@ def masked_logits(space: spaces.Space, logits: th.Tensor, masks: th.Tensor) -> t
     return logits.masked_fill(~masks, _IMPOSSIBLE)
 
 
-class IAC(ActiveStepsAlgorithmMixin, A2C):
+class IAC(SafeFilesMixin, ActiveStepsAlgorithmMixin, A2C):
     """
     Independent actor-critic with a critic of states, IAC-V (Foerster et al. 2018, arXiv:1705.08926, Sec. 3).
 

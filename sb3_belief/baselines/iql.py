@@ -15,11 +15,12 @@ from stable_baselines3.dqn.dqn import DQN
 from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
 from sb3_belief.baselines.q_networks import MaskedQCnnPolicy, MaskedQMultiInputPolicy, MaskedQPolicy
 from sb3_belief.common.action_masks import env_masks
+from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 SelfIQL = TypeVar("SelfIQL", bound="IQL")
 
 
-class IQL(DQN):
+class IQL(SafeFilesMixin, DQN):
     """
     Independent Q-learning (Tan 1993) with a deep network (Mnih et al. 2015): each agent learns its own values, and the others
     are part of its environment. The target of an action u at the observation o is

@@ -1,13 +1,10 @@
 """The part of BeliefPPO and MaskableBeliefPPO that they have in common."""
 
-import io
-import os
 import sys
 import warnings
-from collections.abc import Iterable
 from dataclasses import asdict, fields
 from numbers import Real
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -30,13 +27,10 @@ from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptio
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, check_same_others, others_of
 from sb3_belief.belief_ppo.others_baseline import take_off
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
-from sb3_belief.common.safe_files.models import add_plain_data, load_model_zip, read_model, write_model
-from sb3_belief.common.safe_files.trust import Trust
-
-SelfBelief = TypeVar("SelfBelief", bound="BeliefAlgorithmMixin")
+from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 
-class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
+class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
     """
     Makes an SB3 algorithm of PPO's kind one with a belief.
 
@@ -187,60 +181,6 @@ class BeliefAlgorithmMixin(DetailsAlgorithmMixin):
         refuse_many_agents(env, type(self).__name__)
         self._check_others(self._wrap_env(env, verbose=0))
         super().set_env(env, force_reset)
-
-    # -- files ---------------------------------------------------------------------------------------------------------
-
-    def save(
-        self,
-        path: str | os.PathLike[str] | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Save the model as SB3 does. The zip also holds as plain data what SB3 pickles in it, so that ``load`` needs no pickle.
-
-        :param path: Path of the file (".zip" is added to a name without a suffix), or an open binary file
-        :param exclude: As SB3's
-        :param include: As SB3's
-        """
-        buffer = io.BytesIO()
-        super().save(buffer, exclude, include)
-        add_plain_data(buffer, self)
-        write_model(path, buffer.getvalue())
-
-    @classmethod
-    def load(
-        cls: type[SelfBelief],
-        path: str | os.PathLike[str] | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: Any = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        trust_pickle: bool = False,
-        allow_packages: Iterable[str] = (),
-        **kwargs: Any,
-    ) -> SelfBelief:
-        """
-        Load a model as SB3 does, without running anything of whoever made the file.
-
-        :param path: Path of the file, with or without ".zip", or an open binary file
-        :param env: As SB3's
-        :param device: As SB3's
-        :param custom_objects: As SB3's: what replaces saved attributes
-        :param print_system_info: As SB3's
-        :param force_reset: As SB3's
-        :param trust_pickle: Whether to load what is pickled, too: files of SB3 alone and of earlier versions, and functions. A
-            pickle can run any code of whoever made the file
-        :param allow_packages: Packages of your own of which the file may name classes and functions
-        :param kwargs: As SB3's: arguments that replace the saved ones
-        :return: The model
-        :raises ValueError: If the file is damaged, or needs a pickle or a package that is not trusted
-        """
-        content, where = read_model(path)
-        trust = Trust.of(trust_pickle, allow_packages)
-        options = dict(env=env, device=device, print_system_info=print_system_info, force_reset=force_reset)
-        return load_model_zip(super().load, content, where, trust, custom_objects, **options, **kwargs)
 
     # -- rollout -------------------------------------------------------------------------------------------------------
 

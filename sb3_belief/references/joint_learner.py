@@ -3,8 +3,9 @@
 from typing import ClassVar
 
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 
 def check_joint_env(
@@ -29,7 +30,7 @@ def check_joint_env(
         raise ValueError(f"{learner} needs agents with Discrete actions, and those of this environment are Box: {joint}.")
 
 
-class JointLearnerMixin(BaseAlgorithm):
+class JointLearnerMixin(SafeFilesMixin):
     """
     Stands before SB3's class among the bases of an algorithm that learns in a ``JointVecEnv``.
 
