@@ -4,6 +4,7 @@ The description of a study: a YAML file that says which algorithms are compared 
 It is data like every configuration here. What each key means is in docs/studies.md.
 """
 
+import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -313,13 +314,14 @@ def _excluded(section: Section, arms: Mapping[str, Arm], places: Mapping[str, St
     for each in section.items("{arm: <label>, environment: <id>}"):
         keys = ("arm", "environment")
         each.mapping("{arm: <label>, environment: <id>}", keys, keys)
-        pairs.add(
-            (
-                each["arm"].chosen("algorithm of this study", arms),
-                each["environment"].chosen("environment of this study", places),
-            )
-        )
+        labels = _one_or_more(each["arm"], "algorithm of this study", arms)
+        pairs |= set(itertools.product(labels, _one_or_more(each["environment"], "environment of this study", places)))
     return frozenset(pairs)
+
+
+def _one_or_more(section: Section, what: str, known: Mapping[str, Any]) -> list[str]:
+    """Return the names that stand alone or in a list."""
+    return [each.chosen(what, known) for each in (section.items("names") if isinstance(section.value, list) else [section])]
 
 
 def _train_options(section: Section) -> dict[str, Any]:

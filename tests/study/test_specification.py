@@ -50,6 +50,16 @@ def test_the_whole_matrix(tmp_path):
     assert again.to_data() == study.to_data() and again.pairs() == study.pairs()
 
 
+def test_lists_leave_out_all_their_pairs(tmp_path):
+    lists = (
+        "exclude: [{arm: [ce, ippo], environment: [convention-swap]}, {arm: dynamic, environment: [traffic-junction-easy]}]"
+    )
+    study = read(tmp_path, FILE.replace("exclude: [{arm: ce, environment: convention-swap}]", lists))
+    assert study.pairs() == [("ippo", EASY), ("ce", EASY), ("dynamic", "convention-swap")]
+    with pytest.raises(ConfigError, match=r"line 13: exclude: arm: unknown"):
+        read(tmp_path, FILE.replace("arm: ce,", "arm: [ippo, c],"))
+
+
 def test_overrides_come_in_order(tmp_path):
     study = read(tmp_path, FILE.replace("reward_scale: 0.5}}", "reward_scale: 0.5}, gamma: 0.7, n_timesteps: 7000}"))
     plain, own = (study.config(arm, EASY) for arm in ("dynamic", "ce"))
