@@ -55,7 +55,7 @@ test: $(STAMP)  ## run all tests but the slow ones
 test-slow: $(STAMP)  ## play the games that prove the belief dynamic
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m slow $(PYTEST_ARGS)
 
-test-games: $(STAMP)  ## play the games of the comparison set with five seeds each (most of an hour)
+test-games: $(STAMP)  ## play all games with five seeds each (most of an hour)
 	GAME_SEEDS=5 $(BIN)/python -m pytest -n $(PYTEST_JOBS) -m slow tests/games $(PYTEST_ARGS)
 
 pytest: test
