@@ -139,6 +139,7 @@ def _facts(reported: Reported, findings: Findings) -> StudyFacts:
         final_episodes=reported.final_episodes,
         is_online=reported.is_online,
         ablations=reported.ablations,
+        trained=_trained(reported),
         notices=[*_notes(reported), *reported.notices],
     )
 
@@ -195,7 +196,11 @@ def _write_run_page(page: Page, path: Path) -> None:
         file.write(text)
 
 
-def _notes(reported: Reported) -> list[str]:
+def _trained(reported: Reported) -> dict[str, str]:
     """Return what has to be said of algorithms that are not decentralised, as their runs have noted it."""
     notes = {run.arm: str(run.data.record.get("note") or "") for run in reported.runs}
-    return [f"{arm} {notes[arm]}." for arm in reported.arms if notes.get(arm)]
+    return {arm: notes[arm] for arm in reported.arms if notes.get(arm)}
+
+
+def _notes(reported: Reported) -> list[str]:
+    return [f"{arm} {note}." for arm, note in _trained(reported).items()]

@@ -152,6 +152,19 @@ def test_tables_are_csv_files(study, report):
     assert {row["package"]: row["version"] for row in read("versions")} == VERSIONS
 
 
+def test_every_table_says_what_is_not_decentralised(tmp_path):
+    note = "uses the global state in training"
+    folder = write_study(tmp_path / "mixed", {"ippo": ("ippo", 0.5), "central": ("qmix", 0.6)}, ["junction"], n_seeds=2)
+    for path in folder.glob("cells/central/**/run.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), "note": note}))
+    path, _ = write_report(ReportOptions(str(folder)))
+    assert f"central {note}." in Page(path).shown
+    for table, column in (("results", "trained"), ("other-evaluations", "trained"), ("runs", "note")):
+        with open(files(path) / "tables" / f"{table}.csv", newline="") as file:
+            said = {row["arm"]: row[column] for row in csv.DictReader(file)}
+        assert said == {"ippo": "", "central": note}, table
+
+
 def test_figures_are_files_and_hold_what_the_page_holds(report, page):
     (holder,) = [text for text in page.scripts if text.startswith('{"scores')]
     specs = json.loads(holder)

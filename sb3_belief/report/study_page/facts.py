@@ -101,6 +101,7 @@ class StudyFacts:
     :param ablations: {title of a panel: its arms}
     :param notices: Further things that the reader must know
     :param is_online: Whether the episodes of the trainings themselves count, instead of evaluations
+    :param trained: {arm: how it was trained}, of those that are not decentralised
     """
 
     name: str
@@ -112,6 +113,7 @@ class StudyFacts:
     ablations: Mapping[str, Sequence[str]] = field(default_factory=dict)
     notices: Sequence[str] = ()
     is_online: bool = False
+    trained: Mapping[str, str] = field(default_factory=dict)
 
     def versions(self) -> dict[str, list[str]]:
         """

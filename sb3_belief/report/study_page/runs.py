@@ -38,7 +38,7 @@ def runs_section(facts: StudyFacts, unit: str, run_pages: Mapping[str, str]) -> 
             "joint_steps": run.joint_steps,
             "score": run.score,
             "minutes": None if run.seconds is None else run.seconds / 60,
-            "note": run.why_not or None,
+            "note": "; ".join(filter(None, (run.why_not, facts.trained.get(run.arm)))) or None,
         }
         for run in facts.runs
     ]

@@ -113,11 +113,17 @@ class StudyPage:
         others = self._others()
         return PageSection("results", "Results", [*blocks, *([others] if others.rows else [])])
 
+    @property
+    def _trained(self) -> list[Column]:
+        """The column that says how algorithms were trained, where one of them is not decentralised."""
+        return [Column("trained", "training")] if self.facts.trained else []
+
     def _headline(self) -> Table:
         baseline = self.findings.baseline
         columns = [
             Column("environment", "environment"),
             Column("arm", "algorithm"),
+            *self._trained,
             Column("iqm", "IQM", "number", help=f"Interquartile mean of the {self.findings.unit} over the seeds"),
             Column("interval", "95 % interval", "interval", help="Stratified bootstrap over the seeds"),
             Column("seeds", "runs", "count"),
@@ -147,6 +153,7 @@ class StudyPage:
                 row: dict[str, Any] = {
                     "environment": place,
                     "arm": arm,
+                    "trained": self.facts.trained.get(arm),
                     "iqm": each.score.value,
                     "interval": ends(each.score),
                     "seeds": len(each.seeds),
@@ -166,13 +173,15 @@ class StudyPage:
         columns = [
             Column("environment", "environment"),
             Column("arm", "algorithm"),
+            *self._trained,
         ]
         rows: dict[tuple[str, str], dict[str, Any]] = {}
         for each in self.findings.others:
             way = f"{each.checkpoint}, {'greedy' if each.deterministic else 'sampled'}"
             if way not in [column.key for column in columns]:
                 columns += [Column(way, way, "number"), Column(f"{way} 95 %", "95 % interval", "interval", shown=False)]
-            row = rows.setdefault((each.environment, each.arm), {"environment": each.environment, "arm": each.arm})
+            place = {"environment": each.environment, "arm": each.arm, "trained": self.facts.trained.get(each.arm)}
+            row = rows.setdefault((each.environment, each.arm), place)
             row.update({way: each.score.value, f"{way} 95 %": ends(each.score)})
         order = list(self.findings.environments)
         by_place = sorted(rows.values(), key=lambda row: order.index(row["environment"]))
