@@ -91,7 +91,8 @@ class PolicyFeatures(nn.Module):
         :return: ``p`` as the belief, and the logits
         """
         features = self.encoder(observations)
-        rows = th.zeros(len(features), 0, dtype=th.int, device=features.device)
+        # Of shape[0], since len() would make the number of rows a constant of an exported program
+        rows = th.zeros(features.shape[0], 0, dtype=th.int, device=features.device)
         prediction = self.decoder(features) if predict else None
         return BeliefOutput(
             features, features, th.full_like(features, -math.inf), prediction, rows, features.new_zeros(rows.shape)

@@ -28,7 +28,8 @@ class PolicyGraph(nn.Module):
     ``policy.predict_others``.
 
     The inputs are ``observation``, or ``observation.<key>`` for each key of a Dict, batch first, in the policy's own space
-    (images with the channels first), and for a masked policy ``action_mask``, bool ``[B, k]``. The outputs are, by name:
+    (images with the channels first; of MAPPO the agent's own observation alone), and for a masked policy ``action_mask``, bool
+    ``[B, k]``. The outputs are, by name:
 
     - ``action_probabilities`` ``[B, k]``: the probability of each action (Discrete), of each value dimension after dimension
       (MultiDiscrete), or of a one (MultiBinary);
@@ -60,7 +61,8 @@ class PolicyGraph(nn.Module):
         policy.set_training_mode(False)
         self.policy = policy
         self.masked = isinstance(policy, MaskableActorCriticPolicy)
-        space = policy.observation_space
+        # That of MAPPO observes more in training than it acts by
+        self._space = space = getattr(policy, "own_space", policy.observation_space)
         self.observation_names = [f"observation.{key}" for key in space] if isinstance(space, spaces.Dict) else ["observation"]
         self.normalization = None
         if statistics is not None and statistics.norm_obs:
@@ -85,7 +87,7 @@ class PolicyGraph(nn.Module):
         :param n: Number of observations
         :return: The inputs in the order of ``input_names``, ``n`` rows each
         """
-        space, action_space = self.policy.observation_space, self.policy.action_space
+        space, action_space = self._space, self.policy.action_space
         parts = list(space.values()) if isinstance(space, spaces.Dict) else [space]
         inputs = [th.stack([th.as_tensor(part.sample()) for _ in range(n)]) for part in parts]
         if not self.masked:
@@ -128,8 +130,10 @@ class PolicyGraph(nn.Module):
 
     def _arguments(self, inputs: tuple[th.Tensor, ...]) -> tuple[Any, th.Tensor | None]:
         """Return the observation, normalised and a dict where its space is one, and the mask."""
-        space, parts = self.policy.observation_space, inputs[: len(self.observation_names)]
+        space, parts = self._space, inputs[: len(self.observation_names)]
         observation: Any = dict(zip(space, parts, strict=True)) if isinstance(space, spaces.Dict) else parts[0]
+        if space is not self.policy.observation_space:
+            observation = self.policy.complete(observation)
         if self.normalization is not None:
             observation = self.normalization(observation)
         return observation, inputs[-1] if self.masked else None

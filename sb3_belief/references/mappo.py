@@ -121,6 +121,19 @@ class CentralPolicyMixin(DetailsPolicyMixin, BeliefNetworksMixin):
         )
         self._add_layer_norms()
 
+    def complete(self, own: Any) -> dict[str, th.Tensor]:
+        """
+        Return observations with zeros for what only the critic sees, on which actions do not depend.
+
+        :param own: The agent's own, in :attr:`own_space`: a tensor ``[B, ...]``, or a dict of tensors
+        :return: In the policy's observation space
+        """
+        parts = own if isinstance(own, Mapping) else {OWN: own}
+        n = next(iter(parts.values())).shape[0]
+        space: Any = self.observation_space
+        hidden = {key: th.zeros(n, *space[key].shape, device=self.device) for key in (STATE, CRITIC_ID)}
+        return {key: {**parts, **hidden}[key] for key in space}
+
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
         Convert observations as the policy does. Where they are the agent's own alone, zeros stand in for what only the critic

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -13,10 +14,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_belief import Team, make_team_env
+from sb3_belief.baselines import AMFPPO
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.export import export_model
+from sb3_belief.references import MAPPO, WithState
 from tests.belief_ppo.helpers import SMALL, make_model, observations_of
 from tests.belief_ppo.toy_envs import AmongOthers
+from tests.references.test_mappo import Stateful
 
 N = 1000
 IMAGE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -210,6 +215,30 @@ def test_policies_of_sb3_are_exported_or_refused(tmp_path):
     with pytest.raises(ValueError, match=r"in the format 'torch'; end it in .pt2"):
         export_model(a2c, tmp_path / "b.onnx", "torch")
     assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
+
+
+def one_of_a_team(algorithm, policy, env):
+    team = Team(algorithm, policy, env, seed=0, n_steps=8, batch_size=16, n_epochs=1, device="cpu").learn(16)
+    return team.agents["agent_1"]
+
+
+def test_of_mappo_the_agents_own_observation_is_enough(tmp_path):
+    model: Any = one_of_a_team(MAPPO, "MultiInputPolicy", WithState(make_team_env(Stateful, n_envs=2, seed=0)))
+    export_model(model, tmp_path / "a.onnx", "onnx")
+    own = np.stack([model.observation_space["obs"].sample() for _ in range(N)])
+    assert_equal_outputs(run_onnx(tmp_path / "a.onnx", {"observation": own}), expected_outputs(model, own))
+
+
+def test_policy_features_are_exported_in_both_formats(tmp_path):
+    model: Any = one_of_a_team(AMFPPO, "MlpPolicy", make_team_env(Stateful, n_envs=2, seed=0))
+    observations, inputs = inputs_of(model)
+    expected = expected_outputs(model, observations)
+    export_model(model, tmp_path / "a.onnx", "onnx")
+    assert_equal_outputs(run_onnx(tmp_path / "a.onnx", inputs), expected)
+    export_model(model, tmp_path / "a.pt2", "torch")
+    program = th.export.load(tmp_path / "a.pt2").module()
+    found = {name: rows.detach().numpy() for name, rows in program(th.as_tensor(observations)).items()}
+    assert_equal_outputs(found, expected)
 
 
 class Sharper(BeliefActorCriticPolicy):
