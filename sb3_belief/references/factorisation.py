@@ -185,9 +185,13 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
         :param gradient_steps: Number of updates
         :param batch_size: Episodes in each
         """
-        if self._n_episodes - self._episodes_updated < self.n_envs or self.replay_buffer.size() < batch_size:
+        if self._n_episodes - self._episodes_updated < self.n_envs:
             return
-        self._episodes_updated = self._n_episodes
+        if self.replay_buffer.size() < batch_size:
+            self._episodes_updated = self._n_episodes
+            return
+        # Episodes of other lengths end at other times: those beyond n_envs count for the next update
+        self._episodes_updated += self.n_envs
         self._update_learning_rate(self._optimizers)
         logs = [self._update(self.replay_buffer.sample(batch_size)) for _ in range(gradient_steps)]
         self._n_updates += gradient_steps

@@ -14,7 +14,8 @@ class JointSamples(NamedTuple):
 
     :param observations: Joint observations, ``[B, ...]`` by key
     :param actions: Joint actions as they were stored, ``[B, ...]``
-    :param next_observations: Those after the steps, of the same episode, ``[B, ...]`` by key
+    :param next_observations: Those after the steps, of the same episode, ``[B, ...]`` by key; of an agent whose own return
+        ends there, its last one
     :param rewards: The agents' own rewards, ``[B, n]``
     :param ends: Whether an agent's own return ended, 1 or 0, ``[B, n]``
     :param in_play: Whether an agent was in play when it acted, 1 or 0, ``[B, n]``
@@ -45,6 +46,12 @@ class JointReplayBuffer(DictReplayBuffer):
     def add(
         self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
+        obs_after = next_obs["obs"].copy()
+        for copy, info in enumerate(infos):
+            for agent, row in info.get("last_obs", {}).items():
+                # What follows is not of this return any more
+                obs_after[copy, agent] = row
+        next_obs = {**next_obs, "obs": obs_after}
         for array, key in ((self.own_rewards, "own_rewards"), (self.own_ends, "own_ends"), (self.in_play, "in_play")):
             array[self.pos] = [info[key] for info in infos]
         super().add(obs, next_obs, action, reward, done, infos)

@@ -26,13 +26,14 @@ class JointVecEnv(VecEnvWrapper):
     - ``state`` float32 ``[d_s]``: the global state, see ``TeamVecEnv.states``
     - ``active`` ``[n]``: whether an agent is in play, as far as is known before it acts
     - ``mask`` ``[n, U]``, for Discrete actions: which are legal; the last are not for an agent with fewer. Where the
-      environment leaves none, as it may to an agent out of play, it is the first
+      environment leaves none, as it may to an agent out of play, it is the first, and so it is for one that has left
 
     Actions are MultiDiscrete, one for each agent, or a Box ``[n, W]`` of the agents' Box actions, each as a row that is filled
     up to the widest one by numbers in [-1, 1] that count for nothing. The reward is the team's, the end that of its episode.
     The info has what that of the ``TeamVecEnv`` has, ``terminal_observation`` in the form above, and, for each agent ``[n]``,
     ``in_play`` bool (whether it was when it acted), ``own_rewards`` float32 and ``own_ends`` bool (whether its own return
-    ended, rather than being cut off by a limit).
+    ended, rather than being cut off by a limit). While the team plays on, it also has ``last_obs``, {i: float32 ``[d]``}, the
+    last observations of agents whose own return has ended or been cut off there.
 
     :param venv: The environment of the team
     :raises TypeError: If it is none
@@ -109,6 +110,8 @@ class JointVecEnv(VecEnvWrapper):
             masks = {agent: own[None] for agent, own in info.get("terminal_action_masks", {}).items()}
             row = self._joint(last, info["terminal_state"][None], active[[copy]], masks)
             shown[copy]["terminal_observation"] = {key: part[0] for key, part in row.items()}
+        for copy in np.flatnonzero(~dones):
+            shown[copy]["last_obs"] = self._last_obs(infos[copy])
         # Those that have ended are at the beginning of another episode
         active[dones] = 1
         return self._joint(obs, self.venv.states(), active, self.venv.action_masks()), rewards, dones, shown
@@ -134,6 +137,17 @@ class JointVecEnv(VecEnvWrapper):
             masks = self.action_masks()
             return [None if masks is None else masks[i] for i in self._get_indices(indices)]
         return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+
+    def _last_obs(self, info: dict[str, Any]) -> dict[int, np.ndarray]:
+        """Return the last observations of agents whose own return has ended here while the team plays on, by their places."""
+        found = info.get("terminal_observation", {})
+        width = self.observation_space["obs"].shape[1]  # type: ignore[index]
+        rows = {}
+        for i, agent in enumerate(self._agents):
+            if agent in found:
+                row = self._flat[agent]({agent: map_parts(_one_row, found[agent])})[0]
+                rows[i] = np.pad(row, (0, width - len(row))).astype(np.float32)
+        return rows
 
     @staticmethod
     def _of_each(info: dict[str, Any], done: bool) -> dict[str, np.ndarray]:

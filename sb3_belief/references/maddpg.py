@@ -168,14 +168,16 @@ class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
 
     def critic_loss(self, samples: JointSamples) -> th.Tensor:
         """
-        Return the critics' mean squared errors.
+        Return the critics' mean squared errors, each over the steps in which its agent was in play.
 
         :param samples: ``B`` joint steps
         :return: Their sum over the agents, a number
         """
         policy = self.policy
         values = policy.critic_values(policy.critics, samples.observations["state"], policy.joint(samples.actions))
-        return ((values - self.targets(samples)) ** 2).mean(dim=0).sum()
+        # Between two lives an agent has no return
+        in_play = samples.in_play
+        return (in_play * (values - self.targets(samples)) ** 2).sum(dim=0).div(in_play.sum(dim=0).clamp(min=1)).sum()
 
     def actor_loss(self, samples: JointSamples) -> th.Tensor:
         """

@@ -34,8 +34,8 @@ class StepRecord(NamedTuple):
     :param agent_rewards: Own rewards of the n agents
     :param flags: What the step meant for each agent
     :param visible: Whose action of this step each agent could observe, bool ``[n, n-1+n_scripted]``
-    :param action_masks: Masks of all agents for their next actions, side by side in one row (True for an agent that has none);
-        None if the environment has no masks
+    :param action_masks: Masks of all agents for their next actions, side by side in one row (True for an agent that has none,
+        the first action for one that has left); None if the environment has no masks
     :param scripted_actions: Flattened actions of the scripted others, float32 ``[W_scripted]``; None if there are none
     """
 

@@ -1,6 +1,6 @@
 """A PettingZoo ``ParallelEnv`` as a single Gymnasium environment, so that SB3's own vectorisers can hold copies of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import isfinite
 from typing import Any, TypeAlias
@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_belief.common.action_masks import mask_row, mask_width, wrong_width
+from sb3_belief.common.action_masks import first_actions, mask_row, mask_width, wrong_width
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.common.plain_data import PlainData
 from sb3_belief.vec_env.copy_state import CopyState
@@ -198,17 +198,18 @@ class JointEnv(gym.Env):
                 infos = plain_infos(infos, agents, self._where)
             events = find_events(agents, before, after, terminations, truncations, infos, self._copy, self._t)
             info = own_infos(infos, self.action_spaces) if any_info else {}
-            info["joint"] = self._record(agent_rewards, events.flags, infos if any_info or self._has_masks else None)
-            return self._after_events(obs, team_reward, events, not after, info)
+            done, cuts = events.ended or not after, dict(zip(agents, events.flags.truncated, strict=True))
+            gone = [a for a in agents if a not in after and (a not in before or not (done or cuts[a]))]
+            info["joint"] = self._record(agent_rewards, events.flags, infos if any_info or self._has_masks else None, gone)
+            return self._after_events(obs, team_reward, events, done, info)
         record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
         return obs, team_reward, False, False, {"joint": record}
 
     def _after_events(
-        self, obs: dict[str, Any], team_reward: float, events: Events, all_left: bool, info: dict[str, Any]
+        self, obs: dict[str, Any], team_reward: float, events: Events, done: bool, info: dict[str, Any]
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Return a step in which something has happened to an agent."""
         flags, left = events.flags, events.left
-        done = events.ended or all_left
         if done or left:
             self._check_ends(obs, flags, self.possible_agents if done else left)
         observations = self._observations(obs)
@@ -238,14 +239,13 @@ class JointEnv(gym.Env):
             return plain_team_reward(reward, self._where)
         return reward
 
-    def _record(self, agent_rewards: list[float], flags: Flags, infos: dict[str, Any] | None) -> StepRecord:
+    def _record(self, rewards: list[float], flags: Flags, infos: Any, gone: Sequence[str] = ()) -> StepRecord:
         """Return the record of a step; without infos there are no masks to look for."""
-        visible = self._others.all_visible if flags is self._no_event else None
-        if visible is None:
-            visible = self._others.rows(flags.active, self._copy, self._t)
-        masks = None if infos is None else self._masks(infos).get("action_masks")
+        always = self._others.all_visible if flags is self._no_event else None
+        visible = self._others.rows(flags.active, self._copy, self._t) if always is None else always
+        masks = None if infos is None else self._masks(infos, gone).get("action_masks")
         scripted_actions = self._scripted.actions() if self.scripted_action_spaces else None
-        return StepRecord(agent_rewards, flags, visible, masks, scripted_actions)
+        return StepRecord(rewards, flags, visible, masks, scripted_actions)
 
     def _check_ends(self, obs: dict[str, Any], flags: Flags, ended: list[str]) -> None:
         """Check the last observations of agents that left or, if the episode is over, of all."""
@@ -345,19 +345,19 @@ class JointEnv(gym.Env):
         if names is not None and len(names) != len(self.possible_agents):
             raise forgotten_agents(type(self.env).__name__, self.possible_agents, list(names), self._where)
 
-    def _masks(self, infos: dict[str, dict[str, Any]]) -> dict[str, np.ndarray]:
-        """Return ``action_masks`` as in ``StepRecord``, or nothing as long as no info has held a mask."""
+    def _masks(self, infos: dict[str, dict[str, Any]], gone: Sequence[str] = ()) -> dict[str, np.ndarray]:
+        """Return ``action_masks`` as in ``StepRecord``, or nothing as long as no info has held a mask. ``gone`` have left."""
         self._has_masks = self._has_masks or any("action_mask" in (infos.get(a) or ()) for a in self.possible_agents)
         if not self._has_masks:
             return {}
         masks = []
         # What is wrong with masks is mostly wrong from the beginning
         where = self._where if self._t < 2 else None
-        for agent in self.possible_agents:
-            width = self._mask_widths[agent]
+        for agent, width in self._mask_widths.items():
             info = infos.get(agent) or {}
             if "action_mask" not in info or not width:
-                masks.append(np.ones(width, dtype=bool))
+                # All of them would let those into a joint maximum which nobody may ever take
+                masks.append(first_actions(self.action_spaces[agent]) if agent in gone else np.ones(width, dtype=bool))
                 continue
             mask = mask_row(info["action_mask"], self.action_spaces[agent], agent, where)
             if mask.size != width:
