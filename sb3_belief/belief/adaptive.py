@@ -1,5 +1,5 @@
 """
-A belief that adapts while it plays (issue 20): for teammates that change within a rollout, or differ among the copies of the
+A belief that adapts while it plays: for teammates that change within a rollout, or differ among the copies of the
 environment, where the paper's :class:`~sb3_belief.belief.DynamicBelief` looks back on the rollout before only.
 """
 

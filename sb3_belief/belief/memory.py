@@ -1,4 +1,4 @@
-"""The memory of an adaptive belief: an agent's own steps, each with what the others did and what became of it (issue 20)."""
+"""The memory of an adaptive belief: an agent's own steps, each with what the others did and what became of it."""
 
 from typing import NamedTuple
 

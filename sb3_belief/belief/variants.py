@@ -11,7 +11,7 @@ class Variant(NamedTuple):
     :param attends: Whether the belief is inferred from the agent's history too (eq. 3 and 4), or from its observation alone
     :param samples: Whether the belief is a distribution (eq. 5), which the KL divergence keeps near the prior, or a point
     :param predicts: Whether the belief is trained by predicting the others' actions (eq. 7)
-    :param online: Whether the history includes the earlier steps of the rollout under way (issue 20)
+    :param online: Whether the history includes the earlier steps of the rollout under way (docs/adaptive_belief.md)
     """
 
     attends: bool

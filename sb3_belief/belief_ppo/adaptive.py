@@ -1,4 +1,4 @@
-"""The features of an agent whose belief adapts while it plays, and its memory of the rollout under way (issue 20)."""
+"""The features of an agent whose belief adapts while it plays, and its memory of the rollout under way."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -302,7 +302,6 @@ def refuse_many_agents(env: Any, algorithm: str) -> None:
     if is_pettingzoo or (isinstance(env, VecEnv) and hasattr(env, "possible_agents")):
         raise TypeError(
             f"{algorithm} trains one agent, but {type(env).__name__} is an environment of many. To train one model per agent "
-            f'use Team({algorithm}, "BeliefPolicy", make_team_env(...)). To train one learner among fixed partners, wrap it '
-            "in a gymnasium.Env that plays the partners' part and shows the learner its own observation, with "
-            "'others_action_spaces', and 'others_actions' and 'others_visible' in info."
+            f'use Team({algorithm}, "BeliefPolicy", make_team_env(...)). To train one learner among fixed partners use '
+            "sb3_belief.AgentEnv."
         )

@@ -57,7 +57,8 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param stats_window_size: As in PPO
     :param tensorboard_log: As in PPO
     :param policy_kwargs: As in PPO, and ``embedding_dim``, ``latent_dim``, ``fusion_activation_fn``, ``belief_from_features``
-        (by default True for images) of :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin`
+        (by default True for images) of :class:`~sb3_belief.belief_ppo.policies.BeliefPolicyMixin`, and ``obs_layer_norm``,
+        ``action_gain`` of :class:`~sb3_belief.belief_ppo.on_policy_details.DetailsPolicyMixin`
     :param verbose: As in PPO
     :param seed: As in PPO
     :param device: As in PPO
@@ -65,7 +66,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
     :param belief: ``"dynamic"`` (the paper's method), ``"none"`` (independent PPO), or an ablation (Table 2): ``"context"``
         with the history but without the latent's distribution, ``"variational"`` with the distribution but without the
         history, ``"static"`` with neither, ``"wide"`` with as many weights as ``"dynamic"``, but neither, and no prediction;
-        or ``"adaptive"``, ours, which also attends to the rollout under way (issue 20)
+        or ``"adaptive"``, ours, which also attends to the rollout under way (docs/adaptive_belief.md)
     :param history_length: ``T_h``, how many of its own active steps the agent remembers, at least 1 (Sec. 5: 800)
     :param keep_ratio: ``p``, the share of them it attends to, in (0, 1] (Sec. 5: 0.05); at least one row is kept
     :param action_coef: ``alpha``, weight of the error of the predicted actions (eq. 8: 0.5), at least 0; may be a schedule of

@@ -1,4 +1,4 @@
-"""What a belief that predicts more than the present step is trained on (issue 20)."""
+"""What a belief that predicts more than the present step is trained on."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A baseline of the advantages that sees what the others did in the same step (issue 20)."""
+"""A baseline of the advantages that sees what the others did in the same step."""
 
 from typing import Any
 

@@ -286,7 +286,8 @@ class BeliefPolicyMixin(RememberingMixin):
         if not (self.has_belief and self.options.variant.predicts):  # type: ignore[union-attr]
             raise ValueError(
                 f"this policy has belief={self.options.belief!r} and {self.layout.n_others} others: it predicts nobody's "
-                "actions. A belief that does needs others and one of 'dynamic', 'context', 'variational', 'static'."
+                "actions. A belief that does needs others and one of 'dynamic', 'context', 'variational', 'static' and "
+                "'adaptive'."
             )
         self.set_training_mode(False)
         tensor, vectorized = self.obs_to_tensor(observation)

@@ -20,6 +20,16 @@ def test_the_page_names_them_all():
     assert sorted(re.findall(r"`(\w+)\.yml`", table)) == NAMES
 
 
+def test_the_pages_examples_are_taken(tmp_path, capsys):
+    blocks = re.findall(r"```yaml\n(.*?)```", (FOLDER.parents[1] / "docs" / "studies.md").read_text(), re.DOTALL)
+    studies = [block for block in blocks if "environments:" in block]
+    assert studies
+    for number, block in enumerate(studies):
+        path = tmp_path / f"example_{number}.yml"
+        path.write_text(block)
+        assert main(["study", str(path), "-f", str(tmp_path / "logs"), "--dry-run"]) == 0, capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_dry_run_of_each(name, tmp_path, capsys):
     words = ["study", str(FOLDER / f"{name}.yml"), "-f", str(tmp_path / "logs"), "--dry-run"]
