@@ -23,7 +23,7 @@ def check_joint_env(
     if not isinstance(observed, spaces.Dict) or not {"obs", "state", "active"} <= observed.spaces.keys():
         raise ValueError(
             f"{learner} learns in a team's environment shown as one: JointVecEnv(make_team_env(...)) of"
-            f" sb3_belief.references.joint_vec_env, not in {env!r}."
+            f" sb3_belief.references, not in {env!r}."
         )
     joint = getattr(env, "action_space", None)
     if not isinstance(joint, actions):
