@@ -155,7 +155,8 @@ def test_rollout_and_update_are_sb3s_own(algorithm, stock, monkeypatch):
     make_model(algorithm=algorithm).learn(2 * ROLLOUT)
     assert calls == ["collect_rollouts", "train"] * 2
     ours = [base for base in algorithm.__mro__ if base.__module__.startswith("sb3_belief")]
-    assert len(ours) == 4
+    mixins = ["BeliefAlgorithmMixin", "SafeFilesMixin", "DetailsAlgorithmMixin", "ActiveStepsAlgorithmMixin"]
+    assert [base.__name__ for base in ours] == [algorithm.__name__, *mixins]
     assert not {"train", "collect_rollouts"} & set(vars(algorithm))
 
 
