@@ -1,8 +1,8 @@
 """
 What factorised values learn in games whose exact answers are known (docs/baselines/centralised.md).
 
-Who must fail by the mathematics does, and who can represent the answer finds it, QPLEX not with every seed; what has no theorem is
-reported on that page.
+Who must fail by the mathematics does, and who can represent the answer finds it, QPLEX not with every seed; what has no
+theorem is reported on that page.
 """
 
 import numpy as np
