@@ -46,15 +46,14 @@ class JointReplayBuffer(DictReplayBuffer):
     def add(
         self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        obs_after = next_obs["obs"].copy()
+        pos = self.pos
+        for array, key in ((self.own_rewards, "own_rewards"), (self.own_ends, "own_ends"), (self.in_play, "in_play")):
+            array[pos] = [info[key] for info in infos]
+        super().add(obs, next_obs, action, reward, done, infos)
         for copy, info in enumerate(infos):
             for agent, row in info.get("last_obs", {}).items():
                 # What follows is not of this return any more
-                obs_after[copy, agent] = row
-        next_obs = {**next_obs, "obs": obs_after}
-        for array, key in ((self.own_rewards, "own_rewards"), (self.own_ends, "own_ends"), (self.in_play, "in_play")):
-            array[self.pos] = [info[key] for info in infos]
-        super().add(obs, next_obs, action, reward, done, infos)
+                self.next_observations["obs"][pos, copy, agent] = row
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None

@@ -32,8 +32,8 @@ class JointVecEnv(VecEnvWrapper):
     up to the widest one by numbers in [-1, 1] that count for nothing. The reward is the team's, the end that of its episode.
     The info has what that of the ``TeamVecEnv`` has, ``terminal_observation`` in the form above, and, for each agent ``[n]``,
     ``in_play`` bool (whether it was when it acted), ``own_rewards`` float32 and ``own_ends`` bool (whether its own return
-    ended, rather than being cut off by a limit). While the team plays on, it also has ``last_obs``, {i: float32 ``[d]``}, the
-    last observations of agents whose own return has ended or been cut off there.
+    ended, rather than being cut off by a limit). Where either is so while the team plays on, it also has ``last_obs``,
+    {i: float32 ``[d]``}, the last observations of these agents.
 
     :param venv: The environment of the team
     :raises TypeError: If it is none
@@ -104,14 +104,16 @@ class JointVecEnv(VecEnvWrapper):
         obs, rewards, dones, infos = self.venv.step_wait()
         active = np.stack([self._active(info) for info in infos])
         shown = [{**info, **self._of_each(info, bool(done))} for info, done in zip(infos, dones, strict=True)]
-        for copy in np.flatnonzero(dones):
-            info = infos[copy]
+        for copy, info in enumerate(infos):
+            if "terminal_observation" not in info:
+                continue
             last = {agent: map_parts(_one_row, own) for agent, own in info["terminal_observation"].items()}
-            masks = {agent: own[None] for agent, own in info.get("terminal_action_masks", {}).items()}
-            row = self._joint(last, info["terminal_state"][None], active[[copy]], masks)
-            shown[copy]["terminal_observation"] = {key: part[0] for key, part in row.items()}
-        for copy in np.flatnonzero(~dones):
-            shown[copy]["last_obs"] = self._last_obs(infos[copy])
+            if dones[copy]:
+                masks = {agent: own[None] for agent, own in info.get("terminal_action_masks", {}).items()}
+                row = self._joint(last, info["terminal_state"][None], active[[copy]], masks)
+                shown[copy]["terminal_observation"] = {key: part[0] for key, part in row.items()}
+            else:
+                shown[copy]["last_obs"] = {self._agents.index(agent): self._rows(agent, own)[0] for agent, own in last.items()}
         # Those that have ended are at the beginning of another episode
         active[dones] = 1
         return self._joint(obs, self.venv.states(), active, self.venv.action_masks()), rewards, dones, shown
@@ -138,15 +140,11 @@ class JointVecEnv(VecEnvWrapper):
             return [None if masks is None else masks[i] for i in self._get_indices(indices)]
         return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
-    def _last_obs(self, info: dict[str, Any]) -> dict[int, np.ndarray]:
-        """Return the last observations of agents whose own return has ended here while the team plays on, by their places."""
-        found = info.get("terminal_observation", {})
-        width = self.observation_space["obs"].shape[1]  # type: ignore[index]
-        rows = {}
-        for i, agent in enumerate(self._agents):
-            if agent in found:
-                row = self._flat[agent]({agent: map_parts(_one_row, found[agent])})[0]
-                rows[i] = np.pad(row, (0, width - len(row))).astype(np.float32)
+    def _rows(self, agent: str, obs: Any) -> np.ndarray:
+        """Return observations of an agent, ``[k, ...]``, in the form of all, float32 ``[k, d]``."""
+        flat, space = self._flat[agent]({agent: obs}), self.observation_space["obs"]  # type: ignore[index]
+        rows = np.zeros((len(flat), space.shape[1]), dtype=np.float32)
+        rows[:, : flat.shape[1]] = flat
         return rows
 
     @staticmethod
@@ -168,9 +166,7 @@ class JointVecEnv(VecEnvWrapper):
         self, obs: TeamObs, states: np.ndarray, active: np.ndarray, masks: Mapping[str, np.ndarray] | None
     ) -> dict[str, np.ndarray]:
         space: Any = self.observation_space
-        rows = np.zeros((len(active), *space["obs"].shape), dtype=np.float32)
-        for i, agent in enumerate(self._agents):
-            rows[:, i, : self._flat[agent].width] = self._flat[agent]({agent: obs[agent]})
+        rows = np.stack([self._rows(agent, obs[agent]) for agent in self._agents], axis=1)
         joint = {"obs": rows, "state": states.astype(np.float32), "active": active}
         if self.n_actions:
             joint["mask"] = np.zeros((len(active), *space["mask"].shape), dtype=np.int8)

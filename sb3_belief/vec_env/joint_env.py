@@ -198,8 +198,8 @@ class JointEnv(gym.Env):
                 infos = plain_infos(infos, agents, self._where)
             events = find_events(agents, before, after, terminations, truncations, infos, self._copy, self._t)
             info = own_infos(infos, self.action_spaces) if any_info else {}
-            done, cuts = events.ended or not after, dict(zip(agents, events.flags.truncated, strict=True))
-            gone = [a for a in agents if a not in after and (a not in before or not (done or cuts[a]))]
+            done, cut = events.ended or not after, events.flags.truncated
+            gone = [a for i, a in enumerate(agents) if a not in after and (a not in before or not (done or cut[i]))]
             info["joint"] = self._record(agent_rewards, events.flags, infos if any_info or self._has_masks else None, gone)
             return self._after_events(obs, team_reward, events, done, info)
         record = self._record(agent_rewards, self._no_event, infos if self._has_masks else None)
