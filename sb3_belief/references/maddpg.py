@@ -15,7 +15,7 @@ from torch import nn
 from sb3_belief.common.checks import check_integer, check_share
 from sb3_belief.references.joint_learner import JointLearnerMixin
 from sb3_belief.references.joint_replay import JointReplayBuffer, JointSamples
-from sb3_belief.references.maddpg_policy import MaddpgPolicy, maddpg_actor_loss
+from sb3_belief.references.maddpg_policy import MaddpgPolicy, maddpg_actor_loss, sum_of_means
 
 
 class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
@@ -176,8 +176,7 @@ class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
         policy = self.policy
         values = policy.critic_values(policy.critics, samples.observations["state"], policy.joint(samples.actions))
         # Between two lives an agent has no return
-        in_play = samples.in_play
-        return (in_play * (values - self.targets(samples)) ** 2).sum(dim=0).div(in_play.sum(dim=0).clamp(min=1)).sum()
+        return sum_of_means((values - self.targets(samples)) ** 2, samples.in_play)
 
     def actor_loss(self, samples: JointSamples) -> th.Tensor:
         """

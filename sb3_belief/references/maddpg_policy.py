@@ -141,7 +141,18 @@ def maddpg_actor_loss(values: th.Tensor, outputs: th.Tensor, in_play: th.Tensor,
     """
     counts = outputs.isfinite()
     squares = (outputs.masked_fill(~counts, 0.0) ** 2).sum(dim=-1) / counts.sum(dim=-1)
-    return ((in_play * (coef * squares - values)).sum(dim=0) / in_play.sum(dim=0).clamp(min=1)).sum()
+    return sum_of_means(coef * squares - values, in_play)
+
+
+def sum_of_means(losses: th.Tensor, in_play: th.Tensor) -> th.Tensor:
+    """
+    Return the sum over the agents of each one's mean loss over the steps in which it was in play.
+
+    :param losses: ``[B, n]``
+    :param in_play: 1 for an agent in play, otherwise 0, ``[B, n]``
+    :return: A number; nothing of an agent that was never in play
+    """
+    return ((in_play * losses).sum(dim=0) / in_play.sum(dim=0).clamp(min=1)).sum()
 
 
 def _networks(n_agents: int, n_in: int, n_out: int, net_arch: list[int]) -> nn.Sequential:

@@ -5,7 +5,8 @@ The environment shows an agent its own observation with the state beside it (``r
 network is given the columns of its own observation only, so its weights are all that a deployed agent needs.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -121,18 +122,19 @@ class CentralPolicyMixin(DetailsPolicyMixin, BeliefNetworksMixin):
         )
         self._add_layer_norms()
 
-    def complete(self, own: Any) -> dict[str, th.Tensor]:
+    def complete(self, own: Any, zeros: Callable[..., Any] = th.zeros) -> dict[str, Any]:
         """
         Return observations with zeros for what only the critic sees, on which actions do not depend.
 
-        :param own: The agent's own, in :attr:`own_space`: a tensor ``[B, ...]``, or a dict of tensors
+        :param own: The agent's own, in :attr:`own_space`: one or several, an array, a tensor, or a dict of such
+        :param zeros: Makes the zeros of a shape, as ``own`` is a tensor or an array
         :return: In the policy's observation space
         """
         parts = own if isinstance(own, Mapping) else {OWN: own}
-        n = next(iter(parts.values())).shape[0]
         space: Any = self.observation_space
-        hidden = {key: th.zeros(n, *space[key].shape, device=self.device) for key in (STATE, CRITIC_ID)}
-        return {key: {**parts, **hidden}[key] for key in space}
+        key, part = next(iter(parts.items()))
+        leading = np.shape(part)[: len(np.shape(part)) - len(space[key].shape)]
+        return {**parts, **{key: zeros((*leading, *space[key].shape)) for key in (STATE, CRITIC_ID)}}
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """
@@ -143,13 +145,7 @@ class CentralPolicyMixin(DetailsPolicyMixin, BeliefNetworksMixin):
         :return: As in the policy
         """
         if not (isinstance(observation, Mapping) and STATE in observation):
-            own = observation if isinstance(observation, Mapping) else {OWN: observation}
-            space: Any = self.observation_space
-            key = next(iter(own))
-            given = np.shape(own[key])
-            leading = given[: len(given) - len(space[key].shape)]
-            hidden = {key: np.zeros((*leading, *space[key].shape), dtype=np.float32) for key in (STATE, CRITIC_ID)}
-            observation = {**own, **hidden}
+            observation = self.complete(observation, partial(np.zeros, dtype=np.float32))
         return super().obs_to_tensor(observation)
 
 
