@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sb3_belief.team import AgentEnv
-from sb3_belief.team.sb3_protocol import algorithm_arguments
 from sb3_belief.zoo.names import ALGOS
-from tests.baselines.test_decentralised import SMALL, Masked
+from tests.baselines.test_decentralised import Masked, make_team
 from tests.references.test_mappo import Stateful
-from tests.team.helpers import Team, make_team_env, parameters
+from tests.team.helpers import parameters
 
 OURS = [name for name, algo in ALGOS.items() if algo.path.startswith("sb3_belief.")]
 # One whose agents are the environment's own, and see what they see there
@@ -21,21 +20,6 @@ PARTNERS = [name for name in OURS if not ALGOS[name].adapter and name != "drpiqn
 
 def env_of(name):
     return Masked if "maskable" in name else Stateful
-
-
-def trained(name):
-    algo = ALGOS[name]
-    algo_class, adapter = algo.load(), algo.load_adapter()
-    kwargs = {key: value for key, value in {**SMALL, **algo.fixed}.items() if key in algorithm_arguments(algo_class)}
-    if name == "rode":
-        kwargs["policy_kwargs"] = {"n_roles": 2}
-    windows = {"observe_window": 3} if name == "drpiqn" else {}
-    env = make_team_env(env_of(name), n_envs=2, seed=0, **windows)
-    env = env if adapter is None else adapter(env)
-    # SB3's classes have several policies, a joint learner the one of its own
-    aliases = algo_class.policy_aliases
-    policy = "MlpPolicy" if "MlpPolicy" in aliases else next(iter(aliases))
-    return Team(algo_class, policy, env, seed=0, **kwargs).learn(32)
 
 
 @pytest.fixture
@@ -50,7 +34,7 @@ def no_pickles(monkeypatch):
 
 @pytest.mark.parametrize("name", OURS)
 def test_the_zip_of_one_model(name, tmp_path, no_pickles):
-    model: Any = next(iter(trained(name).agents.values()))
+    model: Any = next(iter(make_team(name).learn(32).agents.values()))
     model.save(tmp_path / "model.zip")
     again = type(model).load(tmp_path / "model.zip", device="cpu")
     assert all(np.array_equal(one, other) for one, other in zip(parameters(again), parameters(model), strict=True))
@@ -60,7 +44,7 @@ def test_the_zip_of_one_model(name, tmp_path, no_pickles):
 @pytest.mark.parametrize("name", PARTNERS)
 def test_one_zip_is_a_partner(name, tmp_path):
     """As a path: its algorithm is found in the file, and its masks are given to it."""
-    team = trained(name)
+    team = make_team(name).learn(32)
     model = team.agents["agent_1"]
     model.save(tmp_path / "one.zip")
     own = team.get_env().possible_agents[0]

@@ -47,11 +47,16 @@ def make_team(name: str, normalize: Any = False, **env_kwargs: Any) -> Any:
     algo_class = algo.load()
     env_class = Numbers if name in ("ddpg", "td3", "sac", "tqc", "crossq") else Masked if "maskable" in name else Stateful
     kwargs = {key: value for key, value in {**SMALL, **algo.fixed}.items() if key in algorithm_arguments(algo_class)}
-    policy = next(alias for alias in ("MlpPolicy", "MlpLstmPolicy") if alias in algo_class.policy_aliases)
+    if name == "rode":
+        kwargs["policy_kwargs"] = {"n_roles": 2}
+    # SB3's classes have several policies, a joint learner the one of its own
+    aliases = algo_class.policy_aliases
+    policy = next((alias for alias in ("MlpPolicy", "MlpLstmPolicy") if alias in aliases), next(iter(aliases)))
     # The one that reads windows of observations
     windows = {"observe_window": 3} if name == "drpiqn" else {}
     env = make_team_env(lambda: env_class(**env_kwargs), n_envs=2, seed=0, **windows)
-    return Team(algo_class, policy, env, seed=0, normalize=normalize, **kwargs)
+    adapter = algo.load_adapter()
+    return Team(algo_class, policy, adapter(env) if adapter else env, seed=0, normalize=normalize, **kwargs)
 
 
 def parts_of(*roots: Any) -> dict[tuple[str, int], str]:

@@ -1,27 +1,16 @@
 """What a recurrent agent remembers over episodes goes with it into an evaluation, where it is known to need it."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 from sb3_contrib import RecurrentPPO
 
-from sb3_belief import Team, make_team_env
+from sb3_belief import make_team_env
 from sb3_belief.study.meetings import Among, Meeting, Play
 from sb3_belief.team import PartnerRecurrentPPO
-from tests.team.guest_env import HOSTS, GuestEnv
+from tests.team.guest_env import HOSTS, GuestEnv, trained_guest
 
-SETTINGS: dict[str, Any] = dict(
-    n_steps=16,
-    batch_size=256,
-    n_epochs=4,
-    learning_rate=1e-2,
-    gamma=0.0,
-    gae_lambda=0.0,
-    device="cpu",
-    policy_kwargs={"net_arch": [16], "lstm_hidden_size": 16},
-)
 PLAY = Play(episodes=8, n_envs=8, repetitions=1)
 
 
@@ -42,11 +31,6 @@ class OneHost(GuestEnv):
         return seen if self.clue else {"guest": seen["guest"] * np.array([1, 0], dtype=np.float32)}
 
 
-def trained(algo):
-    env = make_team_env(partial(GuestEnv, every=2), n_envs=16, seed=0, partner_starts=True)
-    return Team(algo, "MultiInputLstmPolicy", env, seed=1, **SETTINGS).learn(10 * 256)
-
-
 def beside(team, host, model=None):
     """Return the meeting of a guest with a host whom it can tell while it observes, and not while it is evaluated."""
     env, observed = (
@@ -61,7 +45,7 @@ def returns(meeting, steps):
 
 
 def test_a_memory_over_episodes_goes_with_the_agent():
-    team = trained(PartnerRecurrentPPO)
+    team = trained_guest(PartnerRecurrentPPO)
     found = {host: returns(beside(team, host), (0, 2)) for host in HOSTS}
     # Without the clue it does the same beside both, and so is right beside one of them at the most
     assert found["left"][0] + found["right"][0] == pytest.approx(2.0)
@@ -75,7 +59,7 @@ def test_a_memory_over_episodes_goes_with_the_agent():
 
 
 def test_a_memory_of_the_episode_does_not():
-    team = trained(RecurrentPPO)
+    team = trained_guest(RecurrentPPO)
     for host in HOSTS:
         meeting = beside(team, host)
         found = returns(meeting, (0, 2, 3))

@@ -1,12 +1,17 @@
 """A host who stays the same for some episodes, and a guest who can learn which one it is only in the first of them."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_belief import Team, make_team_env
+
 HOSTS = ("left", "right")
+# Of a recurrent algorithm that learns to remember a host from its first episode to its second, in the steps of trained_guest()
+_SETTINGS: dict[str, Any] = dict(n_steps=16, batch_size=256, n_epochs=4, learning_rate=1e-2, gamma=0.0, gae_lambda=0.0)
 
 
 class GuestEnv(ParallelEnv):
@@ -68,3 +73,10 @@ class GuestEnv(ParallelEnv):
     def observations(self):
         clue = 2 * self.host - 1 if self.episode % self.every == 0 else 0
         return {"guest": np.array([self.t, clue], dtype=np.float32)}
+
+
+def trained_guest(algo):
+    """Return a team of one guest who has met many hosts, each for two episodes, of which the second gives no clue."""
+    env = make_team_env(partial(GuestEnv, every=2), n_envs=16, seed=0, partner_starts=True)
+    kwargs = {**_SETTINGS, "policy_kwargs": {"net_arch": [16], "lstm_hidden_size": 16}}
+    return Team(algo, "MultiInputLstmPolicy", env, seed=1, device="cpu", **kwargs).learn(10 * 256)

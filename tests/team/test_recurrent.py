@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief.team import AgentEnv, ObserveLast, PartnerRecurrentPPO
-from tests.team.guest_env import GuestEnv
+from tests.team.guest_env import GuestEnv, trained_guest
 from tests.team.helpers import Team, make_team_env, parameters
 
 SETTINGS: dict[str, Any] = {
@@ -127,15 +127,10 @@ def test_returns_end_with_episodes_and_are_bootstrapped_at_limits():
 
 def test_only_a_memory_over_episodes_knows_the_host():
     """Each host stays for two episodes. The second gives no clue: that of the first has to be remembered."""
-    settings: dict[str, Any] = dict(n_steps=16, batch_size=256, n_epochs=4, learning_rate=1e-2, gamma=0.0, gae_lambda=0.0)
-    settings["policy_kwargs"] = {"net_arch": [16], "lstm_hidden_size": 16}
-    make = partial(GuestEnv, every=2)
     success = {}
     for algo in (PartnerRecurrentPPO, RecurrentPPO):
-        env = make_team_env(make, n_envs=16, seed=0, partner_starts=True)
-        team = Team(algo, "MultiInputLstmPolicy", env, seed=1, device="cpu", **settings).learn(10 * 256)
-        env = make_team_env(make, n_envs=20, seed=1000, partner_starts=True)
-        mean: Any = evaluate_policy(team, env, n_eval_episodes=160)[0]
+        env = make_team_env(partial(GuestEnv, every=2), n_envs=20, seed=1000, partner_starts=True)
+        mean: Any = evaluate_policy(trained_guest(algo), env, n_eval_episodes=160)[0]
         success[algo.__name__] = mean / 2
     assert success["PartnerRecurrentPPO"] > 0.95
     # At the most: all of the first episodes, and a guess in the second ones
