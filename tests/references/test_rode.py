@@ -12,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_belief.references.agent_net import AgentValues
 from sb3_belief.references.joint_vec_env import JointVecEnv, joint_team
 from sb3_belief.references.rode import RODE
+from sb3_belief.references.rode_policy import RodeValue
 from sb3_belief.references.roles import ActionEffects, group_actions
 from tests.references.counting_team import CountingTeam, joint_env
 from tests.team.exact.test_exact import SaveOnce
@@ -184,6 +185,22 @@ def test_only_the_right_targets_move():
     ends = batch.ends.clone()
     ends[1, 2] = 0
     assert moved(0, ends=ends) == moved(1, ends=ends) == [[False] * 3, [False, False, True]]
+
+
+def test_values_of_illegal_actions_count_for_nothing(monkeypatch):
+    model = with_roles(env=joint_env(n_envs=2, truncates=True), role_start=1)
+    model.learn(12)
+    batch = model.replay_buffer.batch(model.replay_buffer.episodes[:2])
+    assert not batch.mask[:, :3, 1, 2].any() and batch.mask[:, 3, 1, 2].all(), "legal in the last observation alone"
+    # All stay in the role of this action; where it is not legal, the role has none, and all legal ones may be chosen
+    batch.actions[..., 1], model.policy.role_interval = 1, 9
+    of_roles, of_actions = model.role_targets(batch)
+    values_of = RodeValue.action_values
+    # The value of this action is raised everywhere
+    monkeypatch.setattr(RodeValue, "action_values", lambda *args: values_of(*args) + 100 * th.eye(3)[2])
+    of_roles_then, of_actions_then = model.role_targets(batch)
+    assert th.equal(of_roles_then, of_roles)
+    assert ((of_actions_then - of_actions).abs() > 1e-3).tolist() == [[False, False, True]] * 2
 
 
 @pytest.mark.parametrize("recurrent", [True, False])
