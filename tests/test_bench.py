@@ -3,12 +3,13 @@
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch as th
 
-from benchmarks import acting, attention, batched_envs, bench, gpu, heavy
+from benchmarks import acting, attention, batched_envs, bench, gpu, heavy, teams
 from benchmarks.measure import Sample, alternate, cores, ratio, spread, take
 from benchmarks.report import BARS, Report
 from benchmarks.teams import PHASES, TeamLoop, junction_team, milliseconds, spread_team, time_of
@@ -102,33 +103,36 @@ def test_the_phases_of_a_loop_are_all_of_its_time(rollouts):
         assert parts == pytest.approx(getattr(measured, clock), rel=0.05, abs=0.005)
 
 
-def test_time_is_added_to_the_phase_in_which_it_passes():
+def test_time_is_added_to_the_phase_in_which_it_passes(monkeypatch):
     team = spread_team("ippo", quick=True)
     env: Any = team.get_env()
     models: list[Any] = list(team.agents.values())
-    waits = {"environment": 0.002, "update": 0.05}
+    passed = {"cpu": 0.0, "wall": 0.0}
+    clocks = SimpleNamespace(process_time=lambda: passed["cpu"], perf_counter=lambda: passed["wall"])
+    monkeypatch.setattr(teams, "time", clocks)
 
     def slow(method, seconds):
         def call(*args):
-            time.sleep(seconds)
+            passed["wall"] += seconds
+            passed["cpu"] += seconds / 4
             return method(*args)
 
         return call
 
-    env.step = slow(env.step, waits["environment"])
+    # Nothing else takes any time
+    env.step = slow(env.step, 2.0)
     for model in models:
-        model.train = slow(model.train, waits["update"])
+        model.train = slow(model.train, 50.0)
     loop = TeamLoop(team)
     loop()
     (environment,), (update,) = (time_of(loop.phases, name) for name in ("environment", "update"))
-    assert environment.wall - environment.cpu > 0.9 * 8 * waits["environment"]
-    assert update.wall - update.cpu > 0.9 * 3 * waits["update"]
+    assert (environment.wall, environment.cpu) == (8 * 2.0, 8 * 0.5)
+    assert (update.wall, update.cpu) == (3 * 50.0, 3 * 12.5)
     (acting_time,) = time_of(loop.phases, "acting")
-    assert acting_time.wall - acting_time.cpu < waits["update"]
+    assert acting_time.wall == acting_time.cpu == 0
     (rollout,) = time_of(loop.phases, "environment", "acting")
-    assert rollout.wall == environment.wall + acting_time.wall
-    found = milliseconds(loop.phases)
-    assert found["update"] == pytest.approx(1000 * update.cpu / update.steps)
+    assert rollout.wall == environment.wall
+    assert milliseconds(loop.phases)["update"] == pytest.approx(1000 * 3 * 12.5 / update.steps)
 
 
 @pytest.mark.parametrize("make", [spread_team, junction_team])
