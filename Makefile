@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# Python compiles what it imports; compiling all of torch takes longer than installing it
+PIP_INSTALL := -m pip install --no-compile
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SMAX_VENV ?= .venv-smax
@@ -42,8 +44,8 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 		{ echo "Python 3.10 or later is needed: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || \
 		{ echo "$(PYTHON) cannot make virtual environments (Debian and Ubuntu: apt-get install python3-venv)"; exit 1; }
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[tests,plots]'
+	$(BIN)/python $(PIP_INSTALL) --quiet -c constraints.txt torch
+	$(BIN)/python $(PIP_INSTALL) --quiet -c constraints.txt -e '.[tests,plots]'
 	@touch $@
 
 demo: $(STAMP)  ## train a team of BeliefPPO agents on Traffic Junction and show what it learned
@@ -75,7 +77,7 @@ bench: $(STAMP)  ## measure speed and memory (25 minutes), into benchmarks/out/b
 # each of the other libraries has an environment of its own; one that cannot be made is skipped, and its log says why
 $(PEERS_VENV)/%/.installed: benchmarks/peers/%.txt
 	$(PYTHON) -m venv $(PEERS_VENV)/$*
-	$(PEERS_VENV)/$*/bin/python -m pip install -r $< >$(PEERS_VENV)/$*.log 2>&1
+	$(PEERS_VENV)/$*/bin/python $(PIP_INSTALL) -r $< >$(PEERS_VENV)/$*.log 2>&1
 	@touch $@
 
 bench-peers: $(STAMP)  ## compare with other libraries (an environment for each: 5 GB), into benchmarks/out/peers.json
@@ -85,8 +87,8 @@ bench-peers: $(STAMP)  ## compare with other libraries (an environment for each:
 # SMAX has an environment of its own: jaxmarl needs gymnasium<1.4, and its pins are those of Python 3.11
 $(SMAX_STAMP): setup.cfg pyproject.toml constraints-smax.txt
 	$(PYTHON) -m venv $(SMAX_VENV)
-	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt torch
-	$(SMAX_VENV)/bin/python -m pip install --quiet -c constraints-smax.txt -e '.[study]' pytest jaxmarl 'gymnasium<1.4'
+	$(SMAX_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints-smax.txt torch
+	$(SMAX_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints-smax.txt -e '.[study]' pytest jaxmarl 'gymnasium<1.4'
 	@touch $@
 
 test-envs: $(STAMP) test-smax  ## run the tests of all environments, each from its package
@@ -98,8 +100,8 @@ test-smax: $(SMAX_STAMP)  ## run the tests of SMAX, in an environment of its own
 # rl_zoo3 has an environment of its own, as a user's would be: without what our tests and plots need beside it
 $(RL_ZOO3_STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(RL_ZOO3_VENV)
-	$(RL_ZOO3_VENV)/bin/python -m pip install --quiet -c constraints.txt torch
-	$(RL_ZOO3_VENV)/bin/python -m pip install --quiet -c constraints.txt -e '.[rl-zoo3]' pytest
+	$(RL_ZOO3_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints.txt torch
+	$(RL_ZOO3_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints.txt -e '.[rl-zoo3]' pytest
 	@touch $@
 
 test-rl-zoo3: $(RL_ZOO3_STAMP)  ## train and search with the real rl_zoo3, in an environment of its own
@@ -108,8 +110,8 @@ test-rl-zoo3: $(RL_ZOO3_STAMP)  ## train and search with the real rl_zoo3, in an
 # Ray, wandb and MLflow have an environment of their own: see constraints-trackers.txt. The tests that do without are among the others
 $(TRACKERS_STAMP): setup.cfg pyproject.toml constraints-trackers.txt
 	$(PYTHON) -m venv $(TRACKERS_VENV)
-	$(TRACKERS_VENV)/bin/python -m pip install --quiet -c constraints-trackers.txt torch
-	$(TRACKERS_VENV)/bin/python -m pip install --quiet -c constraints-trackers.txt -e '.[study,ray,track]' pytest
+	$(TRACKERS_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints-trackers.txt torch
+	$(TRACKERS_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints-trackers.txt -e '.[study,ray,track]' pytest
 	@touch $@
 
 test-trackers: $(TRACKERS_STAMP)  ## run a study on Ray and track runs with wandb and MLflow, in an environment of their own
@@ -119,9 +121,9 @@ test-trackers: $(TRACKERS_STAMP)  ## run a study on Ray and track runs with wand
 # rliable and marl-eval have an environment of their own: the one breaks with newer arch, the other pins an old pandas
 $(STATISTICS_STAMP):
 	$(PYTHON) -m venv $(STATISTICS_VENV)
-	$(STATISTICS_VENV)/bin/python -m pip install --quiet --only-binary arch,numpy,scipy,pandas \
+	$(STATISTICS_VENV)/bin/python $(PIP_INSTALL) --quiet --only-binary arch,numpy,scipy,pandas \
 		rliable==1.2.0 arch==5.6.0 'numpy<2' 'pandas<2.2' colorama 'setuptools<80' wheel
-	$(STATISTICS_VENV)/bin/python -m pip install --quiet --no-deps --no-build-isolation id-marl-eval==0.0.4
+	$(STATISTICS_VENV)/bin/python $(PIP_INSTALL) --quiet --no-deps --no-build-isolation id-marl-eval==0.0.4
 	@touch $@
 
 test-statistics: $(STAMP) $(STATISTICS_STAMP)  ## compare our statistics with rliable's, and read our export with marl-eval
@@ -131,22 +133,22 @@ test-statistics: $(STAMP) $(STATISTICS_STAMP)  ## compare our statistics with rl
 # torchrl has an environment of its own, since nothing but this test needs it
 $(ORACLE_STAMP): setup.cfg constraints.txt
 	$(PYTHON) -m venv $(ORACLE_VENV)
-	$(ORACLE_VENV)/bin/python -m pip install --quiet -c constraints.txt torch
-	$(ORACLE_VENV)/bin/python -m pip install --quiet -c constraints.txt -e '.[oracle]'
+	$(ORACLE_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints.txt torch
+	$(ORACLE_VENV)/bin/python $(PIP_INSTALL) --quiet -c constraints.txt -e '.[oracle]'
 	@touch $@
 
 test-oracle: $(STAMP) $(ORACLE_STAMP)  ## compare our QMIX mixer with torchrl's, in an environment of its own
 	$(BIN)/python -m pytest tests/references/test_torchrl.py $(PYTEST_ARGS)
 
 $(DOCS_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	$(BIN)/python $(PIP_INSTALL) --quiet -c constraints.txt -e '.[docs]'
 	@touch $@
 
 docs: $(DOCS_STAMP)  ## build the pages into docs/_build/html; any warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
 $(PACKAGE_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[package]'
+	$(BIN)/python $(PIP_INSTALL) --quiet -c constraints.txt -e '.[package]'
 	@touch $@
 
 package: $(PACKAGE_STAMP)  ## build the distributions into dist/ and check them, the wheel in an environment of its own

@@ -59,7 +59,7 @@ def main(dist: Path, venv: Path) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         python, elsewhere = venv.resolve() / "bin" / "python", Path(folder)
-        pip = [python, "-m", "pip", "install", "--quiet", "-c", ROOT / "constraints.txt"]
+        pip = [python, "-m", "pip", "install", "--no-compile", "--quiet", "-c", ROOT / "constraints.txt"]
 
         # An agent is served by what an agent needs
         run([*pip, "stable-baselines3", "torch", "gymnasium"], elsewhere)
