@@ -173,7 +173,7 @@ def run_real(folder, script, command):
     (folder / "train_zoo.py").write_text(script)
     words = [sys.executable, "train_zoo.py", *command.split(), *"-n 256 --seed 0 --device cpu --no-optim-plots".split()]
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    result = subprocess.run([*words, "-params", "n_envs:2"], cwd=folder, env=env, capture_output=True, text=True)
+    result = subprocess.run([*words, "-params", "n_envs:2", "n_steps:64"], cwd=folder, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     return result.stdout
 
