@@ -1,5 +1,6 @@
 """The measure of adapting: how well a trained team does beside partners it has not met, the longer it observes them."""
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -38,7 +39,7 @@ from sb3_belief.zoo.run_folder import RECORD, find_team
 #: Steps observed since the swap at which is measured
 CHECKPOINTS = (0, 25, 50, 100, 200, 400, 800)
 # By these a partner of an environment's own stays, and is the same in all copies (where the environment has such arguments)
-_STAYS: Mapping[str, Any] = {"redraw_every": None, "redraw_unit": "rollouts", "per_copy": False}
+_STAYS: Mapping[str, Any] = {"redraw_every": None, "redraw_unit": "rollouts", "per_copy": False, "K": None}
 _COMMAND = "adapt"
 
 
@@ -102,12 +103,17 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
     contenders = [_Contender.of(TEAM, options, _COMMAND)]
     numbers = {}
     for role, given in ((BLIND, options.blind), (ORACLE, options.oracle)):
-        number = _number(given)
+        number = _number(given, f"--{role}")
         if number is not None:
             numbers[role] = number
         elif given is not None:
             # The arguments of the environment are those of its own run: the oracle is told something
             contenders.append(_Contender.of(role, replace(options, run=given, env=options.env), f"--{role}"))
+            if contenders[-1].shown.env_id != contenders[0].shown.env_id:
+                raise ConfigError(
+                    f"--{role}: {given!r} is of {contenders[-1].shown.env_id}, the team of {contenders[0].shown.env_id}: returns"
+                    " of two environments cannot be compared."
+                )
     output = Path(options.output or contenders[0].path.parent / "adaptation")
     check_folder(output, "-o")
     # All partners are met for a moment first, so that the last of them is not refused after the others were measured
@@ -141,13 +147,16 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
     return output, adaptation_sentences(rows, points)
 
 
-def _number(given: str | None) -> float | None:
+def _number(given: str | None, flag: str) -> float | None:
     if given is None or os.path.exists(given):
         return None
     try:
-        return float(given)
+        number = float(given)
     except ValueError:
         return None
+    if not math.isfinite(number):
+        raise ConfigError(f"{flag}: {given} is no return: give a finite number, or a run.")
+    return number
 
 
 def _without_history(contender: _Contender, meeting: Meeting) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from sb3_belief.zoo.replay import ShownEnvironment, ShownTeam, environment_of, l
 from sb3_belief.zoo.run_folder import find_team
 
 _COMMAND = "crossplay"
+# In what runs of one environment with the same arguments may still differ
+_COMPARED = ("partners", "visibility", "env_wrapper", "observations besides (observe_last, memory_span)", "adapters")
 #: Steps that an agent observes of those it meets
 OBSERVED_STEPS = 800
 
@@ -111,7 +114,23 @@ def _common_environment(paths: Sequence[Path], options: CrossplayOptions) -> Sho
                 f"{_COMMAND}: {str(paths[0])!r} and {str(path)!r} have other arguments of {first.env_id}: {differing}. Say by"
                 " --env-kwargs which hold for all."
             )
+        for what, one, other in zip(_COMPARED, _compared(first), _compared(shown), strict=True):
+            if one != other:
+                raise ConfigError(
+                    f"{_COMMAND}: {str(paths[0])!r} and {str(path)!r} were trained with other {what}, so there is no"
+                    " environment in which both can play: give runs that have the same."
+                )
     return first
+
+
+def _compared(shown: ShownEnvironment) -> tuple[Any, ...]:
+    """Return what must be the same for agents of two runs to meet, as of ``_COMPARED``."""
+    partners = shown.partners
+    acting = None if partners is None else (partners.learners, partners.deterministic, vars(partners.pool))
+    functions = (shown.visibility, shown.wrapper, shown.adapter)
+    # Partial functions are equal only to themselves
+    visibility, wrapper, adapter = ((f.func, f.keywords) if isinstance(f, partial) else f for f in functions)
+    return acting, visibility, wrapper, shown.observation, adapter
 
 
 def _measured(meeting: Meeting, steps: Sequence[int], play: Play, env_id: str, run: str, others: str) -> list[dict[str, Any]]:

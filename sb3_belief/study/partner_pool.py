@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_belief.report.adaptation import ALL
 from sb3_belief.study.run_reading import run_folders
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short
@@ -69,6 +70,8 @@ def read_pool(given: str, extra_packages: tuple[str, ...] = ()) -> list[PoolEntr
     if unknown or not members:
         lacks = f"{unknown} are held out but no members" if unknown else "there are no members"
         raise ConfigError(f"--partners: {short(given)}: {lacks}. It must name partners, by members or runs.")
+    if ALL in members:
+        raise ConfigError(f"--partners: {short(given)}: a member is called {ALL!r}, as tables call all of them: rename it.")
     return [PoolEntry(str(name), member) for name, member in members.items() if name in (held_out or members)]
 
 
@@ -81,4 +84,7 @@ def _of_values(argument: str, text: str) -> list[PoolEntry]:
         if not first <= last < first + _MOST:
             raise ConfigError(f"--partners: {argument}:{first}..{last} must go up, over {_MOST:,} values at most.")
         values = list(range(first, last + 1))
+    twice = [value for i, value in enumerate(values) if value in values[:i]]
+    if twice:
+        raise ConfigError(f"--partners: {argument}: {twice} is given twice: give each value once.")
     return [PoolEntry(f"{argument}:{value}", env_kwargs={argument: value}) for value in values]

@@ -165,7 +165,10 @@ def test_partners_act_for_those_whom_a_team_has_no_models_for(teams, tmp_path):
         ({"pool": "seed:9..3"}, "must go up"),
         ({"pool": "lvl:1..2"}, "unknown key 'lvl'"),
         ({"agent": "car_99"}, "unknown agent 'car_99'"),
+        ({"pool": "seed:1,2,1"}, r"\[1\] is given twice"),
         ({"blind": "nowhere"}, "--blind: no file or folder"),
+        ({"blind": "nan"}, "--blind: nan is no return"),
+        ({"oracle": "inf"}, "--oracle: inf is no return"),
         ({"env": "convention-swap"}, "a.zip' cannot be loaded: The saved team has the agents"),
     ],
 )
@@ -190,6 +193,9 @@ def test_pools(teams, tmp_path):
         pool.write_text(yaml.safe_dump(content))
         with pytest.raises(ConfigError, match=message):
             read_pool(str(pool))
+    pool.write_text(yaml.safe_dump({"members": {"all": str(teams["a"])}}))
+    with pytest.raises(ConfigError, match="a member is called 'all'"):
+        read_pool(str(pool))
     with pytest.raises(ConfigError, match="no run in"):
         read_pool(str(tmp_path))
 

@@ -53,7 +53,7 @@ def test_runs_are_the_unit_of_the_interval():
     assert found["loss"].n_seeds == 3 and found["loss"].low < found["loss"].value < found["loss"].high
 
 
-def run_folder(team, folder, env=EASY, **kwargs):
+def run_folder(team, folder, env=EASY, settings=None, **kwargs):
     """Make the folder of a run that saved a team."""
     folder.mkdir()
     (folder / "team.zip").write_bytes(open(team, "rb").read())
@@ -61,7 +61,7 @@ def run_folder(team, folder, env=EASY, **kwargs):
         f'{{"status": "finished", "algo": "belief_ppo", "env": "{env}", "seed": 0, "timesteps": 1}}'
     )
     (folder / "config.yml").write_text(
-        yaml.safe_dump({env: {"policy": "BeliefPolicy", "n_timesteps": 100, "n_envs": 2, "env_kwargs": kwargs}})
+        yaml.safe_dump({env: {"policy": "BeliefPolicy", "n_timesteps": 100, "n_envs": 2, "env_kwargs": kwargs} | (settings or {})})
     )
     return str(folder)
 
@@ -74,6 +74,23 @@ def test_what_cannot_meet_is_refused_before_anything_is_written(teams, tmp_path,
         "give runs of one environment": [one, run_folder(teams[1], tmp_path / "medium", "traffic-junction-medium")],
         r"other arguments of traffic-junction-easy: \['vision'\]": [one, run_folder(teams[1], tmp_path / "far", vision=2)],
     }
+    # Otherwise the agents of one run would play in the environment of another
+    beside = {"partners": {"learners": ["car_0"], "members": {"a": str(teams[0])}}}
+    wrapped = {"env_wrapper": "supersuit.agent_indicator_v0"}
+    for number, (message, *settings) in enumerate(
+        (
+            ("other partners", beside, {"partners": {**beside["partners"], "members": {"a": str(teams[1])}}}),
+            ("other partners", beside, None),
+            ("other env_wrapper", wrapped, None),
+            ("other observations besides", {"observe_last": True}, None),
+            # These have the same; it is the teams that were trained without
+            ("does not fit the saved team", wrapped, wrapped),
+        )
+    ):
+        folders = [tmp_path / f"{number}_{i}" for i in range(2)]
+        given = [run_folder(*each) for each in zip(teams, folders, (EASY, EASY), settings, strict=True)]
+        with pytest.raises(ConfigError, match=message):
+            crossplay(options_of(given, tmp_path, env=None))
     for message, given in runs.items():
         with pytest.raises(ConfigError, match=message):
             crossplay(options_of(given, tmp_path, env=None))
