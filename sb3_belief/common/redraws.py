@@ -55,16 +55,18 @@ class RedrawSchedule:
         """
         return 0 if self.every is None else passed // self.every
 
-    def draw(self, number: int, weights: Sequence[float], copy_seed: int = 0) -> int:
+    def draw(self, number: int, weights: Sequence[float], copy_seed: int = 0, stream: int = 0) -> int:
         """
         Return who is drawn.
 
         :param number: Number of the draw, from 0
         :param weights: Of each that can be drawn, >= 0 and not all 0; they need not sum to 1
         :param copy_seed: The copy's own seed, >= 0. Without ``per_copy`` it does not matter
+        :param stream: Number of those who draw by the same seed, >= 0; each has draws of its own
         :return: An index into ``weights``
         """
-        return _draw(self.seed, (number, copy_seed) if self.per_copy else (number,), tuple(weights))
+        key = (number, copy_seed) if self.per_copy else (number,)
+        return _draw(self.seed, (*key, 0, stream) if stream else key, tuple(weights))
 
 
 # Cached, because all copies ask for the same draw at the same time unless each has its own

@@ -126,7 +126,9 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
 
     At the start of an episode of its own, also where its life ends and it stays in the team, an agent observes zeros in place
     of the last step. One that is told of partners observes its last step over the ends of episodes too, for as long as the
-    partner stays, and zeros where another has come. ``terminal_observation`` holds the step with which the episode ended.
+    partner stays, and zeros where another has come. ``terminal_observation`` holds the step with which the episode ended. A
+    partner of a pool that counts rollouts comes between two steps: the agent is told of it with the observation after the
+    first of its steps, and observes that step.
 
     :param venv: Environment of the team
     :param observe_last: The agents that observe their last step; True for all, False for none
@@ -159,6 +161,8 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
                 self._forms[agent] = LastStepForm(*args, last=agent in last, starts=agent in self._told)
         self._splitter = TransitionSplitter(agents, actions, venv.scripted_action_spaces)
         self._partners: list[str] = []
+        # In which copies a partner has come since the present observations were made
+        self._came = np.zeros(venv.num_envs, dtype=bool)
         super().__init__(
             venv, {agent: self._forms[agent].space if agent in self._forms else observed[agent] for agent in agents}
         )
@@ -166,6 +170,7 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
     def _reset_joint(self) -> TeamObs:
         obs = super()._reset_joint()
         self._other_partners()
+        self._came[:] = False
         n_envs = self.num_envs
         starts = np.ones(n_envs, dtype=bool)
         first = {
@@ -177,6 +182,9 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
     def _step_joint(self, actions: TeamObs) -> TeamStep:
         obs, rewards, dones, infos = step = super()._step_joint(actions)
         others = self._other_partners()
+        # Who came with a rollout has made this step already
+        starts = others | self._came
+        self._came[:] = False
         joined: TeamObs = dict(obs)
         nowhere = np.zeros(self.num_envs, dtype=bool)
         transitions = dict(zip(self.possible_agents, self._splitter.transitions(actions, step), strict=True))
@@ -191,8 +199,12 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
                 for k, copy in enumerate(copies):
                     infos[copy].setdefault("terminal_observation", {})[agent] = row_of(ends, k)
             last[others if agent in self._told else own.dones] = 0.0
-            joined[agent] = form.join(obs[agent], last, others)
+            joined[agent] = form.join(obs[agent], last, starts)
         return joined, rewards, dones, infos
+
+    def begin_rollout(self) -> None:
+        super().begin_rollout()
+        self._came |= self._other_partners()
 
     def _other_partners(self) -> np.ndarray:
         """Return in which copies there is another partner than when this was asked last, bool ``[num_envs]``."""
@@ -202,11 +214,11 @@ class ObserveLastVecEnv(TeamVecEnvWrapper):
         return np.array([old != new for old, new in zip(before or self._partners, self._partners, strict=True)])
 
     def _copies_state(self) -> dict[str, Any]:
-        return {"env": super()._copies_state(), "partners": self._partners}
+        return {"env": super()._copies_state(), "partners": self._partners, "came": self._came.copy()}
 
     def _set_copies_state(self, state: dict[str, Any]) -> None:
         super()._set_copies_state(state["env"])
-        self._partners = state["partners"]
+        self._partners, self._came = state["partners"], state["came"].copy()
 
 
 def with_last_step(

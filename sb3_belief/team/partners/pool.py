@@ -74,7 +74,8 @@ class PartnerPool:
         """
         Return the pool of evaluations: the members that are held out, or all of them if none is.
 
-        In each copy another one is drawn for each episode, whatever the schedule of training is.
+        In each copy another one is drawn for each episode, whatever the schedule of training is: what an agent would learn of
+        a partner who stays for several episodes does not show, see ``sb3-belief adapt`` for that.
         """
         names = [name for name in self.names if name in self.held_out] or self.names
         return self._only(names, RedrawSchedule(1, "episodes", True, self.schedule.seed))
@@ -109,10 +110,12 @@ class PoolDraws:
 
     :param pool: The pool, of which all members can be drawn
     :param n_envs: Number of copies
+    :param stream: Number of the pool in its environment: pools with the same seed draw apart
     """
 
-    def __init__(self, pool: PartnerPool, n_envs: int):
+    def __init__(self, pool: PartnerPool, n_envs: int, stream: int = 0):
         self.names = pool.names
+        self._stream = stream
         self._schedule, self._weights = pool.schedule, list(pool.weights.values())
         #: Index of the member in each copy, int ``[n_envs]``
         self.present = np.zeros(n_envs, dtype=int)
@@ -151,7 +154,7 @@ class PoolDraws:
             # The first rollout that begins ends none
             passed = self._episodes[copy] if self._schedule.unit == "episodes" else max(self._rollouts - 1, 0)
             number = self._schedule.number(passed)
-            self.present[copy] = self._schedule.draw(number, self._weights, self._copy_seeds[copy])
+            self.present[copy] = self._schedule.draw(number, self._weights, self._copy_seeds[copy], self._stream)
 
     def get_state(self) -> dict[str, Any]:
         """Return how far the draws are, as plain data."""

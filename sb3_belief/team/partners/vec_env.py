@@ -92,12 +92,14 @@ class PartnersVecEnv(TeamVecEnvWrapper):
         self._named: list[PoolDraws] = []
         for agent, pool in self._pools.items():
             if id(pool) not in self._draws:
-                self._draws[id(pool)] = PoolDraws(pool.evaluation() if evaluation else pool.training(), self.num_envs)
+                drawn = pool.evaluation() if evaluation else pool.training()
+                self._draws[id(pool)] = PoolDraws(drawn, self.num_envs, stream=len(self._named))
                 if pool is given[agent]:
                     self._named.append(self._draws[id(pool)])
             draws = self._draws[id(pool)]
-            acting = [
-                CopiesPartner(
+            # Of all members, so that one who does not fit is refused now, and not when it is first evaluated
+            fitting = {
+                name: CopiesPartner(
                     agent,
                     _member(pool, name, agent, self._pools),
                     observed[agent],
@@ -105,8 +107,9 @@ class PartnersVecEnv(TeamVecEnvWrapper):
                     deterministic,
                     trust=trust,
                 )
-                for name in draws.names
-            ]
+                for name in pool.names
+            }
+            acting = [fitting[name] for name in draws.names]
             index = venv.possible_agents.index(agent)
             self._seats.append((Seat(agent, index, actions[agent], acting, self.num_envs), draws))
         self._encoders = {name: RowEncoder(name, space) for name, space in partner_spaces.items()}

@@ -10,7 +10,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_belief import BeliefPPO
-from sb3_belief.team import PartnersVecEnv, batched
+from sb3_belief.team import PartnerPool, PartnersVecEnv, batched
 from sb3_belief.team.agent_models import agent_seed, env_seed
 from tests.team.fixed_partners.helpers import AgentEnv, one, toy, zero
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
@@ -197,10 +197,13 @@ def test_a_team_learns_saves_and_loads_beside_partners(tmp_path):
     assert len(returns) == 4 and lengths == [7] * 4
 
 
-def test_partners_need_no_worker_and_do_not_change_with_jobs():
+@pytest.mark.parametrize("schedule", [None, {}, {"redraw_unit": "rollouts", "per_copy": False}])
+def test_partners_need_no_worker_and_do_not_change_with_jobs(schedule):
+    partner: Any = noisy if schedule is None else PartnerPool({"noisy": noisy, "zero": zero}, **schedule)
+
     def learned(jobs, vec_env="dummy"):
         env = make_team_env(ToyEnv, n_envs=2, vec_env=vec_env, env_kwargs={"n_agents": 3})
-        team = Team(PPO, "MlpPolicy", env, seed=1, partners={"agent_0": noisy}, jobs=jobs, **PPO_KWARGS)
+        team = Team(BeliefPPO, "BeliefPolicy", env, seed=1, partners={"agent_0": partner}, jobs=jobs, **BELIEF)
         weights = [parameters(model) for model in team.learn(48).agents.values()]
         env.close()
         return np.stack(weights)

@@ -11,6 +11,7 @@ from stable_baselines3 import PPO
 
 from sb3_belief.common.redraws import RedrawSchedule
 from sb3_belief.team import PartnerPool, PartnersVecEnv
+from sb3_belief.vec_env.observe_last import ObserveLastVecEnv
 from tests.team.fixed_partners.helpers import one, toy, zero
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.partners.helpers import ZERO_ONE, noisy, partnered, play, pool_of, saved_team
@@ -91,6 +92,36 @@ def test_a_pool_of_several_agents_is_drawn_for_all_of_them(tmp_path):
     wrong = PartnerPool({"lacking": {"agent_1": zero}})
     with pytest.raises(ValueError, match=r"'lacking' .* partners for \['agent_1'\], but .* \['agent_1', 'agent_3'\]"):
         PartnersVecEnv(make_team_env(toy(4)), {"agent_1": wrong, "agent_3": wrong})
+
+
+@pytest.mark.parametrize("schedule", [{}, {"redraw_unit": "rollouts", "per_copy": False}])
+def test_two_pools_draw_apart(schedule):
+    env = partnered({"agent_1": pool_of(3, **schedule), "agent_2": pool_of(3, **schedule)}, n_agents=3, n_envs=60)
+    env.reset()
+    met = set()
+    for _ in range(40):
+        env.begin_rollout()
+        met |= set(env.partner_names)
+    assert len(met) == 9
+
+
+def test_the_memory_starts_with_a_partner_who_comes_with_a_rollout():
+    pool = pool_of(3, redraw_unit="rollouts", per_copy=False)
+    env = ObserveLastVecEnv(partnered({"agent_1": pool}, n_envs=2), observe_last=True, partner_starts=True)
+    env.reset()
+    changes = 0
+    for _ in range(12):
+        before = env.get_attr("partner")
+        env.begin_rollout()
+        came = env.get_attr("partner") != before
+        changes += came
+        for starts in (came, False):
+            obs = env.step({"agent_0": np.ones(2, int)})[0]["agent_0"]
+            assert obs["memory_start"].ravel().tolist() == [starts] * 2
+            # What the newcomer did in its first step is not lost, nor at the ends of episodes
+            expected = np.eye(3)[[int(name) for name in env.get_attr("partner")]]
+            np.testing.assert_array_equal(obs["observation"][:, 2:5], expected)
+    assert 4 < changes < 12
 
 
 def test_each_present_member_makes_one_pass_and_keeps_its_memory(tmp_path):
@@ -261,6 +292,7 @@ def test_wrong_pools(members, kwargs, error, message):
         PartnerPool(members, **kwargs)
 
 
-def test_every_member_is_checked_before_anything_starts():
+@pytest.mark.parametrize("held_out", [(), "three"])
+def test_every_member_is_checked_before_anything_starts(held_out):
     with pytest.raises(TypeError, match="The partner 'agent_1' is 3"):
-        partnered({"agent_1": PartnerPool({"zero": zero, "three": 3})})
+        partnered({"agent_1": PartnerPool({"zero": zero, "three": 3}, held_out=held_out)})  # type: ignore[dict-item]
