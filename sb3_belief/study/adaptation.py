@@ -25,7 +25,7 @@ from sb3_belief.report.adaptation import (
     write_rows,
 )
 from sb3_belief.report.figures.drawing import check_drawing
-from sb3_belief.report.page.files import write_figure
+from sb3_belief.report.page.files import remove_figures, write_figure
 from sb3_belief.study.meetings import Among, Meeting, Play
 from sb3_belief.study.partner_pool import PoolEntry, read_pool
 from sb3_belief.team.checkpoint import read_team
@@ -109,11 +109,9 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
         elif given is not None:
             # The arguments of the environment are those of its own run: the oracle is told something
             contenders.append(_Contender.of(role, replace(options, run=given, env=options.env), f"--{role}"))
-            if contenders[-1].shown.env_id != contenders[0].shown.env_id:
-                raise ConfigError(
-                    f"--{role}: {given!r} is of {contenders[-1].shown.env_id}, the team of {contenders[0].shown.env_id}: returns"
-                    " of two environments cannot be compared."
-                )
+            own, other = contenders[0].shown.env_id, contenders[-1].shown.env_id
+            if own != other:
+                raise ConfigError(f"--{role}: {given!r} is of {other}, the team of {own}: their returns cannot be compared.")
     output = Path(options.output or contenders[0].path.parent / "adaptation")
     check_folder(output, "-o")
     # All partners are met for a moment first, so that the last of them is not refused after the others were measured
@@ -136,6 +134,8 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
     points = adaptation_points(rows)
     try:
         make_folder(output)
+        # Not beside those of an earlier measurement, which may have had one more
+        remove_figures(output, "adaptation", "skill")
         write_rows(rows, output / ADAPTATION)
         write_rows([point.columns() for point in points], output / CURVE)
         title = f"{rows[0]['run']}, {rows[0]['environment']}"

@@ -11,7 +11,7 @@ from sb3_belief.common.durable_files import make_folder
 from sb3_belief.report.adaptation import write_rows
 from sb3_belief.report.crossplay import CROSSPLAY, crossplay_figures, crossplay_sentences
 from sb3_belief.report.figures.drawing import check_drawing
-from sb3_belief.report.page.files import write_figure
+from sb3_belief.report.page.files import remove_figures, write_figure
 from sb3_belief.study.meetings import Among, Meeting, Play
 from sb3_belief.zoo.errors import ConfigError, reason_of, short, unknown_setting
 from sb3_belief.zoo.preflight import check_device, check_folder
@@ -88,6 +88,8 @@ def crossplay(options: CrossplayOptions) -> tuple[Path, str]:
         rows = _completed(rows, options.steps)
     try:
         make_folder(output)
+        # Not beside those of an earlier measurement after other numbers of steps
+        remove_figures(output, "crossplay-*")
         write_rows(rows, output / CROSSPLAY)
         for name, (_, spec) in crossplay_figures(rows).items():
             write_figure(spec, output / f"{name}.svg", output / f"{name}.png")

@@ -19,19 +19,10 @@ from sb3_belief.study.meetings import Play
 from sb3_belief.study.partner_pool import read_pool
 from sb3_belief.team import Team, make_team_env
 from sb3_belief.zoo.errors import ConfigError
+from sb3_belief.zoo.replay import make_shown_env
+from tests.study.saved_teams import EASY, TINY, run_folder, save_team
 
-EASY = "traffic-junction-easy"
-TINY: dict[str, Any] = dict(
-    n_steps=8, batch_size=16, n_epochs=1, history_length=12, policy_kwargs=dict(net_arch=[8], embedding_dim=8, latent_dim=4)
-)
 PLAY = Play(episodes=3, n_envs=2, repetitions=2)
-
-
-def save_team(folder, name, seed, belief="dynamic"):
-    env = make_team_env(EASY, n_envs=2, seed=seed)
-    path = folder / f"{name}.zip"
-    Team(BeliefPPO, "BeliefPolicy", env, seed=seed, device="cpu", belief=belief, **TINY).learn(32).save(path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +167,35 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(teams, tmp_path
     with pytest.raises(ConfigError, match=message):
         adapt(options_of(teams, tmp_path, **changed))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_gap_lies_in_one_environment(teams, tmp_path):
+    one = run_folder(teams["a"], tmp_path / "one")
+    other = run_folder(teams["b"], tmp_path / "other", "traffic-junction-medium")
+    with pytest.raises(ConfigError, match="is of traffic-junction-medium, the team of traffic-junction-easy"):
+        adapt(options_of(teams, tmp_path, run=one, env=None, blind=other))
+
+
+@pytest.mark.parametrize("env_id", ["convention-swap", "convention-episode"])
+def test_a_partner_of_the_environment_stays_or_is_refused(env_id, tmp_path, monkeypatch):
+    env = make_team_env(env_id, n_envs=2, seed=0)
+    path = tmp_path / "team.zip"
+    Team(BeliefPPO, "BeliefPolicy", env, seed=0, device="cpu", **TINY).save(path)
+    made = []
+
+    def shown(environment, *args):
+        made.append(environment.env_kwargs)
+        return make_shown_env(environment, *args)
+
+    monkeypatch.setattr("sb3_belief.study.adaptation.make_shown_env", shown)
+    pool = "seed:3" if env_id == "convention-swap" else "partner_seed:3"
+    options = AdaptOptions(str(path), env=env_id, pool=pool, output=str(tmp_path / "out"), play=PLAY, checkpoints=(0, 5))
+    adapt(options)
+    name = "K" if env_id == "convention-swap" else "redraw_every"
+    assert all(kwargs[name] is None for kwargs in made)
+    if env_id == "convention-episode":
+        with pytest.raises(ConfigError, match="is not one partner but several"):
+            adapt(replace(options, env_kwargs=("redraw_every:1", "redraw_unit:episodes", "per_copy:true")))
 
 
 def test_pools(teams, tmp_path):

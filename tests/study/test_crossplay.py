@@ -1,10 +1,10 @@
 """Cross-play: the diagonal is the plain evaluation, and what it says follows from its table."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from sb3_belief.cli.main import main
 from sb3_belief.report.adaptation import read_rows
@@ -14,7 +14,7 @@ from sb3_belief.study.meetings import Play
 from sb3_belief.team import Team, make_team_env
 from sb3_belief.zoo.errors import ConfigError
 from sb3_belief.zoo.evaluate import evaluate
-from tests.study.test_adaptation import EASY, save_team
+from tests.study.saved_teams import EASY, run_folder, save_team
 
 PLAY = Play(episodes=3, n_envs=2, repetitions=1)
 
@@ -31,7 +31,11 @@ def options_of(runs, folder, **changed):
 
 
 def test_the_diagonal_is_the_plain_evaluation(teams, tmp_path):
-    folder, said = crossplay(options_of(teams, tmp_path))
+    options = options_of(teams, tmp_path)
+    Path(options.output).mkdir()
+    for name in ("crossplay-800.svg", "notes.txt"):
+        (Path(options.output) / name).write_text("of an earlier measurement")
+    folder, said = crossplay(options)
     rows = read_rows(folder / "crossplay.csv", CROSSPLAY_TEXTS, CROSSPLAY_NUMBERS)
     matrix = crossplay_matrix(rows, 0)
     for k, path in enumerate(teams):
@@ -42,7 +46,7 @@ def test_the_diagonal_is_the_plain_evaluation(teams, tmp_path):
     assert len(rows) == 2 * 2 * 2 and {row["steps"] for row in rows} == {0, 4}
     assert f"{matrix.diagonal().mean():.3g}" in said
     assert {path.name for path in folder.iterdir()} == {
-        "crossplay.csv",
+        *("crossplay.csv", "notes.txt"),
         *(f"crossplay-{steps}{suffix}" for steps in (0, 4) for suffix in (".svg", ".png")),
     }
 
@@ -51,19 +55,6 @@ def test_runs_are_the_unit_of_the_interval():
     found: Any = crossplay_estimates(np.array([[5.0, 1, 3], [0, 7, 2], [4, 4, 9]]))
     assert [found[name].value for name in ("own", "others", "loss")] == pytest.approx([7, 7 / 3, 14 / 3])
     assert found["loss"].n_seeds == 3 and found["loss"].low < found["loss"].value < found["loss"].high
-
-
-def run_folder(team, folder, env=EASY, settings=None, **kwargs):
-    """Make the folder of a run that saved a team."""
-    folder.mkdir()
-    (folder / "team.zip").write_bytes(open(team, "rb").read())
-    (folder / "run.json").write_text(
-        f'{{"status": "finished", "algo": "belief_ppo", "env": "{env}", "seed": 0, "timesteps": 1}}'
-    )
-    (folder / "config.yml").write_text(
-        yaml.safe_dump({env: {"policy": "BeliefPolicy", "n_timesteps": 100, "n_envs": 2, "env_kwargs": kwargs} | (settings or {})})
-    )
-    return str(folder)
 
 
 def test_what_cannot_meet_is_refused_before_anything_is_written(teams, tmp_path, capsys):

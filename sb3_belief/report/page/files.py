@@ -74,6 +74,19 @@ def write_figure(spec: Mapping[str, Any], *paths: Path) -> None:
             file.write(figure_png(svg) if path.suffix.lower() == ".png" else svg.encode())
 
 
+def remove_figures(folder: Path, *patterns: str) -> None:
+    """
+    Remove what :func:`write_figure` has written.
+
+    :param folder: Where
+    :param patterns: Names of the files without their suffixes, as patterns
+    """
+    for pattern in patterns:
+        for suffix in FIGURE_FORMATS:
+            for path in folder.glob(f"{pattern}{suffix}"):
+                path.unlink()
+
+
 def write_csv(table: Table, path: Path) -> None:
     """
     Write a table as CSV: all its values, in full, in the order of the page.
