@@ -35,15 +35,15 @@ class RedrawSchedule:
 
     def __post_init__(self) -> None:
         if self.every is not None:
-            check_integer("every", self.every, 1, f"for how many {self.unit} a partner stays, or None")
+            check_integer("redraw_every", self.every, 1, f"for how many {self.unit} a partner stays, or None")
         check_integer("seed", self.seed, 0, "which decides who is drawn")
         if self.unit not in UNITS:
-            raise ValueError(f"unit={self.unit!r} is not one of {', '.join(map(repr, UNITS))}.")
+            raise ValueError(f"redraw_unit={self.unit!r} is not one of {', '.join(map(repr, UNITS))}.")
         check_flag("per_copy", self.per_copy)
         if self.unit == "episodes" and not self.per_copy and self.every is not None:
             raise ValueError(
-                "unit='episodes' needs per_copy=True, since the copies end their episodes at different times; partners that"
-                " are the same in all copies change with rollouts."
+                "redraw_unit='episodes' needs per_copy=True, since the copies end their episodes at different times; partners"
+                " that are the same in all copies change with rollouts."
             )
 
     def number(self, passed: int) -> int:

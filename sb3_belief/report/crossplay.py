@@ -9,8 +9,8 @@ from sb3_belief.report.adaptation import Row, estimate_text
 from sb3_belief.report.figures.matrix import matrix_spec
 from sb3_belief.report.statistics import IntervalEstimate, estimate
 
-#: Name of the table in the folder of a measurement
-CROSSPLAY = "crossplay.csv"
+#: Name of the table in the folder of a measurement, and of the one with the cells of the matrices
+CROSSPLAY, MATRIX = "crossplay.csv", "crossplay_matrix.csv"
 CROSSPLAY_TEXTS = ("environment", "run", "others", "agent")
 CROSSPLAY_NUMBERS = ("steps", "repetition", "episodes", "return", "success")
 
@@ -39,6 +39,26 @@ def crossplay_matrix(rows: Sequence[Row], steps: float) -> np.ndarray:
         if row["steps"] == steps:
             cells.setdefault((row["run"], row["others"]), []).append(row["return"])
     return np.array([[np.mean(cells[run, others]) for others in names] for run in names])
+
+
+def crossplay_cells(rows: Sequence[Row]) -> list[tuple[str, str, int, IntervalEstimate]]:
+    """
+    Return the cells of all matrices, with 95 % intervals over repetitions of the mean over agents.
+
+    :param rows: The table
+    :return: For each the run whose agent it is, the run of the others, the steps observed before, and the mean return
+    """
+    names = crossplay_runs(rows)
+    cells: dict[tuple[float, str, str], dict[float, list[float]]] = {}
+    for row in rows:
+        repetitions = cells.setdefault((row["steps"], row["run"], row["others"]), {})
+        repetitions.setdefault(row["repetition"], []).append(row["return"])
+    return [
+        (run, others, int(steps), estimate([np.array([np.mean(of) for of in cells[steps, run, others].values()])], "mean"))
+        for steps in _steps(rows)
+        for run in names
+        for others in names
+    ]
 
 
 def crossplay_estimates(matrix: np.ndarray) -> dict[str, IntervalEstimate]:

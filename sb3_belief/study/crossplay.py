@@ -9,7 +9,7 @@ from typing import Any
 
 from sb3_belief.common.durable_files import make_folder
 from sb3_belief.report.adaptation import write_rows
-from sb3_belief.report.crossplay import CROSSPLAY, crossplay_figures, crossplay_sentences
+from sb3_belief.report.crossplay import CROSSPLAY, MATRIX, crossplay_cells, crossplay_figures, crossplay_sentences
 from sb3_belief.report.figures.drawing import check_drawing
 from sb3_belief.report.page.files import remove_figures, write_figure
 from sb3_belief.study.meetings import Among, Meeting, Play
@@ -91,6 +91,11 @@ def crossplay(options: CrossplayOptions) -> tuple[Path, str]:
         # Not beside those of an earlier measurement after other numbers of steps
         remove_figures(output, "crossplay-*")
         write_rows(rows, output / CROSSPLAY)
+        cells = [
+            {"run": run, "others": others, "steps": steps, "return": of.value, "return_low": of.low, "return_high": of.high}
+            for run, others, steps, of in crossplay_cells(rows)
+        ]
+        write_rows(cells, output / MATRIX)
         for name, (_, spec) in crossplay_figures(rows).items():
             write_figure(spec, output / f"{name}.svg", output / f"{name}.png")
     except OSError as error:

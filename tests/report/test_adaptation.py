@@ -83,11 +83,13 @@ def test_a_report_shows_what_lies_in_its_folder(tmp_path):
     write_rows(table(), tmp_path / "run_1" / "adaptation" / ADAPTATION)
     (tmp_path / "broken" / "adaptation" / ADAPTATION).write_text("nothing\n")
     pairs = [
-        {"environment": "game", "run": run, "others": others, "agent": "a", "steps": steps, "repetition": 0, "episodes": 4}
-        | {"return": float(run == others), "success": None}
+        {"environment": "game", "run": run, "others": others, "agent": agent, "steps": steps, "repetition": r, "episodes": 4}
+        | {"return": (run == others) * (1 + (agent == "b") - r / 2), "success": None}
         for run in "xyz"
         for others in "xyz"
         for steps in (0, 800)
+        for agent in "ab"
+        for r in (0.0, 1.0)
     ]
     write_rows(pairs, tmp_path / CROSSPLAY)
     sections: Any = adapting_sections(tmp_path)
@@ -103,7 +105,12 @@ def test_a_report_shows_what_lies_in_its_folder(tmp_path):
         for figure in block
     ]
     assert len(names) == len(set(names)) == 4
-    assert "0 [0, 0] where it is among those of another run: a loss of 1" in crossplay.blocks[1].replace("\n", " ")
-    cells = crossplay.blocks[-1][0].spec["data"]["values"]
+    assert "0 [0, 0] where it is among those of another run: a loss of 1.25" in crossplay.blocks[1].replace("\n", " ")
+    cells = crossplay.blocks[-2][0].spec["data"]["values"]
     assert {(cell["row"], cell["column"]): cell["value"] for cell in cells}["x", "y"] == 0.0
     assert np.isfinite([cell["value"] for cell in cells]).all()
+    table_of_cells: Any = crossplay.blocks[-1]
+    assert len(table_of_cells.rows) == 3 * 3 * 2
+    own = next(each for each in table_of_cells.rows if (each["run"], each["others"], each["steps"]) == ("y", "y", 800))
+    # Of 1.5 and 1.0, the means over both agents in both repetitions
+    assert own["return"] == 1.25 and own["return_95"][0] < 1.0 and own["return_95"][1] > 1.5

@@ -43,10 +43,12 @@ def test_the_diagonal_is_the_plain_evaluation(teams, tmp_path):
         team = Team.load(path, env=env, device="cpu")
         env.seed(PLAY.episodes_seed(0))
         assert matrix[k, k] == pytest.approx(evaluate(team, env, 3).returns.mean(), rel=1e-6)
+    cells = read_rows(folder / "crossplay_matrix.csv", ("run", "others"), ("steps", "return", "return_low", "return_high"))
+    assert [cell["return"] for cell in cells[:4]] == matrix.ravel().tolist() and len(cells) == 8
     assert len(rows) == 2 * 2 * 2 and {row["steps"] for row in rows} == {0, 4}
     assert f"{matrix.diagonal().mean():.3g}" in said
     assert {path.name for path in folder.iterdir()} == {
-        *("crossplay.csv", "notes.txt"),
+        *("crossplay.csv", "crossplay_matrix.csv", "notes.txt"),
         *(f"crossplay-{steps}{suffix}" for steps in (0, 4) for suffix in (".svg", ".png")),
     }
 

@@ -18,6 +18,7 @@ from sb3_belief.report.crossplay import (
     CROSSPLAY,
     CROSSPLAY_NUMBERS,
     CROSSPLAY_TEXTS,
+    crossplay_cells,
     crossplay_figures,
     crossplay_sentences,
 )
@@ -100,7 +101,17 @@ def _crossplay(path: Path, name: str) -> list[Any]:
     figures: Sequence[Figure] = [
         Figure(f"{name}-{key}", title, spec, what) for key, (title, spec) in crossplay_figures(rows).items()
     ]
-    return [crossplay_sentences(rows), f"{what}.", figures]
+    columns = [
+        Column("run", "the agent is of"),
+        Column("others", "all others are of"),
+        Column("steps", "observed steps", "count"),
+        *_estimated("return", "return", "Mean over repetitions"),
+    ]
+    table = [
+        {"run": run, "others": others, "steps": steps, **_values("return", each)}
+        for run, others, steps, each in crossplay_cells(rows)
+    ]
+    return [crossplay_sentences(rows), f"{what}.", figures, Table(name, "The cells of the matrices", columns, table)]
 
 
 def _estimated(key: str, label: str, help: str) -> list[Column]:
