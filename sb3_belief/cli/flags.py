@@ -84,9 +84,9 @@ def add_partners(parser: argparse.ArgumentParser, otherwise: str) -> None:
     parser.add_argument(
         "--partners",
         type=filled_text,
-        metavar="FILE.yml|RUN",
+        metavar="FILE.yml|RUN|FOLDER",
         help="who acts for the agents that do not learn: a YAML file (learners, members, runs, ...), the folder of a run or a"
-        f" zip; if left out, {otherwise}",
+        f" zip, or a folder of runs, each of which is one of a pool; if left out, {otherwise}",
     )
 
 

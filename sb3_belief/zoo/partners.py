@@ -147,13 +147,13 @@ def partners_of_flag(given: str) -> dict[str, Any]:
     """
     Return the settings that the flag ``--partners`` stands for.
 
-    :param given: A YAML file that holds what the setting ``partners`` holds; or the folder of a run or a zip, which is then
-        the only member, beside the learners that other settings name
+    :param given: A YAML file that holds what the setting ``partners`` holds; or, beside the learners that other settings name,
+        a folder with runs, each of which is a member, or the folder of a run or a zip, which is then the only one
     :return: The setting
     :raises ConfigError: If the file cannot be read
     """
     if not given.endswith((".yml", ".yaml")):
-        return {"members": {_name_of(Path(given)): given}}
+        return {"members": _runs_in(Path(given)) or {_name_of(Path(given)): given}}
     try:
         content = parse(Path(given).read_text(encoding="utf-8"), f"--partners {given}")
     except (OSError, UnicodeDecodeError) as error:
@@ -163,6 +163,19 @@ def partners_of_flag(given: str) -> dict[str, Any]:
     return content
 
 
+def _runs_in(folder: Path) -> dict[str, str]:
+    """Return the runs within a folder that is none itself, by their paths in it."""
+    if not folder.is_dir() or _saved_team(folder) is not None:
+        return {}
+    found = {path.parent for name in (BEST_MODEL, TEAM) for path in folder.rglob(name)}
+    return {path.relative_to(folder).as_posix(): str(path) for path in sorted(found, key=lambda path: _by_numbers(str(path)))}
+
+
+def _saved_team(folder: Path) -> Path | None:
+    """Return the team that a run has saved, the best one if there is such."""
+    return next((folder / name for name in (BEST_MODEL, TEAM) if (folder / name).is_file()), None)
+
+
 def _source(given: Any, location: Location) -> str:
     """Return where a partner is: an absolute path, or a function that may be imported."""
     if not isinstance(given, str):
@@ -170,7 +183,7 @@ def _source(given: Any, location: Location) -> str:
     head, marker, agent = given.partition(".zip:")
     path = Path(f"{head}.zip" if marker else given)
     if path.is_dir():
-        found = next((path / name for name in (BEST_MODEL, TEAM) if (path / name).is_file()), None)
+        found = _saved_team(path)
         if found is None:
             raise ConfigError(f"{location.text}: {given!r} is a folder without {BEST_MODEL} and {TEAM}.")
         return os.path.abspath(found)
@@ -200,7 +213,7 @@ def _matches(pattern: str, location: Location) -> dict[str, str]:
     found: dict[str, str] = {}
     for match in sorted(glob.glob(pattern, recursive=True), key=_by_numbers):
         path = Path(match)
-        if path.suffix == ".zip" or any((path / name).is_file() for name in (BEST_MODEL, TEAM)):
+        if path.suffix == ".zip" or _saved_team(path) is not None:
             name = _name_of(path)
             if name in found:
                 raise ConfigError(

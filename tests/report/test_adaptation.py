@@ -82,7 +82,7 @@ def test_a_report_shows_what_lies_in_its_folder(tmp_path):
         (tmp_path / name / "adaptation").mkdir(parents=True)
     write_rows(table(), tmp_path / "run_1" / "adaptation" / ADAPTATION)
     (tmp_path / "broken" / "adaptation" / ADAPTATION).write_text("nothing\n")
-    pairs = [
+    pairs: Any = [
         {"environment": "game", "run": run, "others": others, "agent": agent, "steps": steps, "repetition": r, "episodes": 4}
         | {"return": (run == others) * (1 + (agent == "b") - r / 2), "success": None}
         for run in "xyz"

@@ -158,6 +158,8 @@ def test_members_of_a_flag_take_the_place_of_those_of_a_file(runs, tmp_path):
     assert load().pool.members == {"a": brake} and load().learners == ("car_1",)
     flag = ("--partners", {"partners": partners_of_flag(str(run))})
     assert load(flag).pool.members == {f"ppo/{EASY}_1": str(run / "team.zip")} and load(flag).learners == ("car_1",)
+    folder = ("--partners", {"partners": partners_of_flag(str(runs))})
+    assert load(folder).pool.members == {f"ppo/{EASY}_{k}": f"{runs}/ppo/{EASY}_{k}/team.zip" for k in (1, 2)}
     assert load(params=["partners:null"]) is None and load(params=["partners.seed:5"]).pool.schedule.seed == 5
     by_agent = {"learners": ["car_0"], "members": {"both": {"car_1": f"{run}/team.zip:car_3", "car_2": f"{HERE}:drive"}}}
     both = load(("--partners", {"partners": by_agent})).pool.members["both"]

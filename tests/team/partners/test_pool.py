@@ -295,4 +295,4 @@ def test_wrong_pools(members, kwargs, error, message):
 @pytest.mark.parametrize("held_out", [(), "three"])
 def test_every_member_is_checked_before_anything_starts(held_out):
     with pytest.raises(TypeError, match="The partner 'agent_1' is 3"):
-        partnered({"agent_1": PartnerPool({"zero": zero, "three": 3}, held_out=held_out)})  # type: ignore[dict-item]
+        partnered({"agent_1": PartnerPool({"zero": zero, "three": 3}, held_out=held_out)})
