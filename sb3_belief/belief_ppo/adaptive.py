@@ -38,6 +38,8 @@ class AdaptiveExtractor(BeliefExtractor):
     belief: AdaptiveBelief  # type: ignore[assignment]
     history_own: th.Tensor
     history_stamps: th.Tensor
+    #: Number of the next step, and in how many copies the agent has acted outside of training, int64 ``[2]``
+    history_clock: th.Tensor
 
     def __init__(
         self,
@@ -58,11 +60,10 @@ class AdaptiveExtractor(BeliefExtractor):
         self.table: Memory | None = None
         #: Past rollouts on which the belief is trained in an update as well; see :func:`replayed`
         self.replay: list[Replayed] = []
-        # Outside of training: the step with which the present episode of each copy began
-        self._began: dict[int, int] = {}
+        self.register_buffer("history_clock", th.zeros(2, dtype=th.int64))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "online": None, "table": None, "replay": [], "_began": {}}
+        return {**super().__getstate__(), "online": None, "table": None, "replay": []}
 
     def _empty_history(self) -> Any:
         belief = self.belief
@@ -76,59 +77,87 @@ class AdaptiveExtractor(BeliefExtractor):
     def restore_history(self, history: Memory) -> None:  # type: ignore[override]
         for name, rows in history._asdict().items():
             setattr(self, f"history_{name}", rows)
-        self._began = {}
+        stamps = history.stamps[history.valid]
+        now = int(stamps[:, 0].max()) + 1 if len(stamps) else 0
+        self._set_clock(now, max(0, DEPLOYED + 1 - int(stamps[:, 1].min())) if len(stamps) else 0)
 
     @property
     def clock(self) -> int:
         """Number of the next step."""
-        stamps = self.history_stamps[self.history_valid]
-        return int(stamps[:, 0].max()) + 1 if len(stamps) else 0
+        return int(self.history_clock[0])
 
-    def append(self, rows: Memory) -> None:
+    @property
+    def n_copies(self) -> int:
+        """In how many copies the agent has acted outside of training."""
+        return int(self.history_clock[1])
+
+    def _set_clock(self, now: int, n_copies: int) -> None:
+        self.history_clock = th.tensor([now, n_copies], device=self.history_clock.device)
+
+    def append(self, rows: Memory, now: int, n_copies: int | None = None) -> None:
         """
         Append steps to the history.
 
         :param rows: The steps, oldest first
+        :param now: Number of the step that follows, whether or not anything was seen before it
+        :param n_copies: In how many copies the agent acts outside of training; None if that has not changed
         """
-        began = self._began
+        n_copies = self.n_copies if n_copies is None else n_copies
         self.restore_history(newest(followed_by(self.history, rows), self.options.history_length))
-        self._began = began
+        self._set_clock(now, n_copies)
 
-    def remember_steps(self, observations: th.Tensor, actions: th.Tensor, own: th.Tensor, copies: np.ndarray | None) -> None:
+    def remember_steps(
+        self, rows: tuple[th.Tensor, th.Tensor, th.Tensor], visible: th.Tensor, copies: np.ndarray | None
+    ) -> None:
         """
         Append steps outside of training.
 
-        :param observations: Preprocessed flat observations, oldest first, ``[N, d_o]``
-        :param actions: The others' actions at those steps, zero where not visible, ``[N, W]``
-        :param own: Own actions and rewards, ``[N, U + 1]``
+        :param rows: As in ``Memory``, oldest first: observations ``[N, d_o]``, the others' actions ``[N, W]``, and own actions
+            and rewards ``[N, U + 1]``
+        :param visible: At which of them somebody was visible, bool ``[N]``
         :param copies: Of which copy each step is, from 0, all of one joint step, int ``[N]``; None for successive steps of one
         """
-        now, n = self.clock, len(observations)
-        times = np.arange(now, now + n) if copies is None else np.full(n, now)
-        places = np.full(n, DEPLOYED) if copies is None else DEPLOYED - copies
-        stamps = np.stack([times, places, [self._began.get(int(place), -1) for place in places]], axis=1)
-        self.append(Memory(observations, actions, own, th.as_tensor(stamps), actions.any(dim=1)))
+        now, n = self.clock, len(visible)
+        times, places = np.arange(now, now + n), np.full(n, DEPLOYED)
+        if copies is not None:
+            times, places = np.full(n, now), DEPLOYED - copies
+        episodes = self._episodes()
+        stamps = np.stack([times, places, [episodes.get(int(place), -1) for place in places]], axis=1)
+        after = now + (n if copies is None else 1)
+        n_copies = max(self.n_copies, 1 if copies is None else int(copies.max(initial=0)) + 1)
+        self.append(Memory(*rows, th.as_tensor(stamps), visible), after, n_copies)
 
-    def end_episodes(self, copies: np.ndarray) -> None:
+    def end_episodes(self, copies: np.ndarray | None) -> None:
         """
         Have what follows belong to other episodes than what was remembered outside of training.
 
-        :param copies: In which copies, int ``[n]`` from 0
+        :param copies: In which copies, int ``[n]`` from 0; None for all
         """
-        self._began.update({DEPLOYED - int(copy): self.clock for copy in copies})
+        ended = range(max(1, self.n_copies)) if copies is None else copies.tolist()
+        stamps = self.history_stamps.clone()
+        for copy in ended:
+            rows = (self.history_valid & (stamps[:, 1] == DEPLOYED - copy)).nonzero()
+            if len(rows):
+                last = stamps[rows[-1, 0]]
+                last[2] = _ended(last[2])
+        self.history_stamps = stamps
+
+    def _episodes(self) -> dict[int, int]:
+        """Return the step with which the present episode began of each copy outside of training of which there is a row."""
+        deployed = self.history_stamps[self.history_valid & (self.history_stamps[:, 1] <= DEPLOYED)]
+        return {place: now + 1 if began < DEPLOYED else began for now, place, began in deployed.tolist()}
 
     def present_stamps(self, n: int) -> th.Tensor:
         """
-        Return the stamps of observations outside of training, of which the i-th is of copy i; of the first copy, if nothing
-        of copy i is remembered: an agent that has observed in one copy may be evaluated in many.
+        Return the stamps of observations outside of training, of which the i-th is of copy i; all are of the first copy for an
+        agent that has acted in one alone, which may be evaluated in many.
 
         :param n: Their number
         :return: int64 ``[n, 3]``
         """
-        now = self.clock
-        remembered = set(self.history_stamps[self.history_valid, 1].tolist())
-        places = [DEPLOYED - copy if DEPLOYED - copy in remembered else DEPLOYED for copy in range(n)]
-        rows = [(now, place, self._began.get(place, -1)) for place in places]
+        now, episodes = self.clock, self._episodes()
+        places = [DEPLOYED - copy if self.n_copies > 1 else DEPLOYED for copy in range(n)]
+        rows = [(now, place, episodes.get(place, -1)) for place in places]
         return th.tensor(rows, dtype=th.int64, device=self.history_stamps.device).reshape(n, 3)
 
     def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:
@@ -180,6 +209,11 @@ class AdaptiveExtractor(BeliefExtractor):
         assert output.prediction is not None
         expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
         return self._beside(own, th.cat([output.mean, expected], dim=-1))
+
+
+def _ended(began: th.Tensor) -> th.Tensor:
+    """Mark the last row of an episode: by a number that no episode has, of which the one it began with can be told."""
+    return th.where(began < DEPLOYED, began, 2 * DEPLOYED - 1 - began)
 
 
 class Replayed(NamedTuple):

@@ -231,7 +231,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
                 )
                 buffer.replay = [*buffer.replay, to_be_replayed(extractor.attended(), *part)][-self.belief_replay :]
             extractor.table, extractor.replay = None, []
-            extractor.append(self.remembered(0, buffer.buffer_size, is_over=True))
+            extractor.append(self.remembered(0, buffer.buffer_size), extractor.clock + buffer.buffer_size)
         else:
             policy.remember(observations, actions)
 
@@ -254,26 +254,27 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
             extractor.online = None
 
     @th.no_grad()
-    def remembered(self, first: int, last: int, is_over: bool = False) -> Memory:
+    def remembered(self, first: int, last: int) -> Memory:
         """
-        Return steps of the present rollout as an adaptive belief remembers them.
+        Return steps of the present rollout as an adaptive belief remembers them: those in which the agent acted or waited for
+        its turn, and saw another one act.
 
         :param first: Number of the first step in the rollout
         :param last: Number of the step after the last one
-        :param is_over: Whether to include what was seen of others while the agent waited for its next turn, which is not known
-            yet while the rollout attends to its own steps
         :return: ``(last - first) * n_envs`` rows, those of all copies at each step
         """
         buffer, policy = self.rollout_buffer, self.policy
         rows = buffer.rows_of(np.arange(first * self.n_envs, last * self.n_envs))
         flat = policy.flat_observations(rollout_rows(buffer.observations, rows, policy.device))
-        actions = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ()))
+        actions, active = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ())), buffer.active[rows]
+        if isinstance(self.action_space, spaces.Box):
+            # As the environment got them
+            actions = np.clip(actions, self.action_space.low, self.action_space.high)
         own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
-        seen_actions, visible = buffer.attended_actions, buffer.attended_visible
-        if is_over:
-            seen_actions, visible = buffer.others_actions, buffer.others_visible
-        valid = buffer.active[rows] & visible[rows].any(axis=1)
-        parts = seen_actions[rows], own, buffer.stamps[rows], valid
+        # Whoever waits does nothing
+        own[~active, :-1] = 0.0
+        valid = (active | buffer.waited[rows]) & buffer.attended_visible[rows].any(axis=1)
+        parts = buffer.attended_actions[rows], own, buffer.stamps[rows], valid
         return Memory(flat, *(th.as_tensor(part, device=policy.device) for part in parts))
 
     def _coefficient(self, name: str) -> float:

@@ -136,7 +136,7 @@ def _rows(key: str, width: int, infos: Sequence[Mapping[str, Any]]) -> np.ndarra
 _REWARD, _VALUE = 2, 4
 _OF_BELIEF = (
     *("noise", "selected", "others_actions", "others_visible"),
-    *("stamps", "own_rewards", "attended_actions", "attended_visible"),
+    *("stamps", "own_rewards", "attended_actions", "attended_visible", "waited"),
 )
 
 
@@ -190,9 +190,10 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
         self.others_visible = np.zeros((*rows, self._widths["others_visible"]), dtype=bool)
         self.stamps = np.zeros((*rows, 3 if self._is_online else 0), dtype=np.int64)
         self.own_rewards = np.zeros(rows if self._is_online else (*rows, 0), dtype=np.float32)
-        # As they are attended to within the rollout: what is seen of others while the agent waits comes into a row later on
+        # As they are attended to: what is seen of others while the agent waits is a row of its own there
         self.attended_actions = np.zeros((*rows, self._widths["others_actions"] if self._is_online else 0), dtype=np.float32)
         self.attended_visible = np.zeros((*rows, self._widths["others_visible"] if self._is_online else 0), dtype=bool)
+        self.waited = np.zeros(rows if self._is_online else (*rows, 0), dtype=bool)
         #: What the rewards of the step that is added next have been raised by, which the agent has not got
         self.bootstraps = np.zeros(self.n_envs, dtype=np.float32)
         # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
@@ -224,6 +225,8 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
             new = self.others_visible[self.pos, copy] & ~self.others_visible[row]
             self.others_visible[row] |= new
             self.others_actions[row] += self.others_actions[self.pos, copy] * new[owners]
+            if self._is_online:
+                self.waited[self.pos, copy] = True
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """

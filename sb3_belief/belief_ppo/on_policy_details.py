@@ -107,6 +107,11 @@ class DetailsPolicyMixin(_Policy):
         """
         super().init_weights(module, self.action_gain if module is getattr(self, "action_net", None) else gain)
 
+    @property
+    def value_unit(self) -> th.Tensor | float:
+        """In which errors of values count: the deviation of the returns where values are normalised, else 1."""
+        return self.value_net.statistics()[1] if isinstance(self.value_net, NormalizedValue) else 1.0
+
     def evaluate_actions(self, obs: Any, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         """
         Evaluate actions as the policy does; the loss of the values joins where the algorithm does not train them as SB3.

@@ -47,19 +47,22 @@ def action_layout(others_action_spaces: Mapping[str, spaces.Space]) -> ActionLay
 
 def others_rows(
     others_action_spaces: Mapping[str, spaces.Space], actions: Any, visible: Mapping[str, Any] | None, n_steps: int
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the others' actions of some steps as the rows of a history hold them.
 
     :param others_action_spaces: The others' action spaces, in their fixed order
-    :param actions: Their actions by name, each ``[N, ...]`` in its own space, without the others that were not visible at all;
-        or rows as in ``info["others_actions"]``, ``[N, W]``
-    :param visible: At which steps each of them was visible, bool ``[N]`` by name; at all if it is left out
+    :param actions: Their actions by name, each ``[N, ...]`` in its own space, without the others that were not visible at all,
+        or None for these; or rows as in ``info["others_actions"]``, ``[N, W]``
+    :param visible: At which steps each of them was visible, bool ``[N]`` by name. If it is left out, at all for which there is
+        an action by name, and in rows where it is not all zeros
     :param n_steps: ``N``
-    :return: float32 ``[N, W]``, zero where not visible
+    :return: float32 ``[N, W]``, zero where not visible, and whether each was, bool ``[N, n_others]``
     :raises ValueError: If a name is unknown, or actions or flags have another shape or are none of their space
     """
     layout, visible = action_layout(others_action_spaces), visible or {}
+    if isinstance(actions, Mapping):
+        actions = {name: given for name, given in actions.items() if given is not None or name not in others_action_spaces}
     names = ", ".join(others_action_spaces)
     for name in (*(actions if isinstance(actions, Mapping) else ()), *visible):
         if name not in others_action_spaces:
@@ -80,13 +83,16 @@ def others_rows(
                 f"{(n_steps, layout.width)}, coded as in the environment's info['others_actions']: one-hot for Discrete and "
                 "each dimension of MultiDiscrete, else the values. Or give each other's actions by its name, in its own space"
             )
+    seen_at = np.zeros((n_steps, len(others_action_spaces)), dtype=bool)
     for owner, (name, space) in enumerate(others_action_spaces.items()):
         columns, seen = layout.columns_of(owner), np.asarray(visible.get(name, np.ones(n_steps, dtype=bool)))
         if not isinstance(actions, Mapping):
             rows[~seen, columns] = 0
+            seen_at[:, owner] = seen if name in visible else rows[:, columns].any(axis=1)
         elif name in actions:
             rows[seen, columns] = _encoded(name, space, actions[name], seen)
-    return rows
+            seen_at[:, owner] = seen
+    return rows, seen_at
 
 
 def _encoded(name: str, space: spaces.Space, actions: Any, seen: np.ndarray) -> np.ndarray:

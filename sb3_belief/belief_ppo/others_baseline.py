@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_belief.belief_ppo.buffers import BeliefBufferMixin, BeliefMinibatch, attach
 from sb3_belief.belief_ppo.extractor import BeliefFeatures, BeliefPass, rollout_rows
-from sb3_belief.belief_ppo.value_loss import ValueTargets
+from sb3_belief.belief_ppo.value_loss import ValueTargets, losses_of
 
 _HIDDEN = 64
 # Of how many steps it is computed at a time
@@ -38,29 +38,39 @@ class OthersBaseline(nn.Module):
         nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(nn.Linear(width + seen_width, _HIDDEN), nn.Tanh(), last).to(device)
 
-    def forward(self, features: BeliefFeatures | th.Tensor, seen: th.Tensor) -> th.Tensor:
+    def forward(self, features: BeliefFeatures | th.Tensor, seen: th.Tensor, unit: th.Tensor | float = 1.0) -> th.Tensor:
         """
         Estimate advantages.
 
         :param features: Features and belief
         :param seen: What the agent saw at once of the others, ``[B, W + n_others]``
+        :param unit: In which the layers predict: the deviation of the returns where values are normalised
         :return: ``[B]``
         """
         known = features if isinstance(features, th.Tensor) else th.cat(features, dim=-1)
-        return self.layers(th.cat([known.detach(), seen], dim=-1)).flatten()
+        return self.layers(th.cat([known.detach(), seen], dim=-1)).flatten() * unit
 
-    def loss(self, features: BeliefFeatures | th.Tensor, minibatch: BeliefMinibatch, targets: ValueTargets) -> th.Tensor:
+    def loss(
+        self,
+        features: BeliefFeatures | th.Tensor,
+        minibatch: BeliefMinibatch,
+        targets: ValueTargets,
+        unit: th.Tensor | float = 1.0,
+        huber_delta: float | None = None,
+    ) -> th.Tensor:
         """
-        Return the squared error of the estimates.
+        Return the error of the estimates, which counts as that of the values does.
 
         :param features: Features and belief of a minibatch
         :param minibatch: What the others did
         :param targets: Returns, and the values while acting, whose differences are estimated
+        :param unit: As of :meth:`forward`
+        :param huber_delta: As of the values' loss; None for squared errors
         :return: A scalar
         """
         assert minibatch.seen_at_once is not None
         advantages = targets.returns - targets.old_values
-        return (advantages - self(features, minibatch.seen_at_once)).square().mean()
+        return losses_of((advantages - self(features, minibatch.seen_at_once, unit)) / unit, huber_delta).mean()
 
 
 @th.no_grad()
@@ -82,7 +92,7 @@ def take_off(baseline: OthersBaseline, policy: Any, buffer: BeliefBufferMixin) -
         belief_pass = BeliefPass(minibatch.noise, minibatch.selected, stamps=minibatch.stamps)
         features = policy.extract_features(attach(rollout_rows(buffer.observations, rows, policy.device), belief_pass))
         assert minibatch.seen_at_once is not None
-        estimates.append(baseline(features, minibatch.seen_at_once).cpu().numpy())
+        estimates.append(baseline(features, minibatch.seen_at_once, policy.value_unit).cpu().numpy())
     rows = buffer.rows_of(steps)
     # SB3 keeps a column where the copies stand one after the other
     before = buffer.advantages[rows].flatten()

@@ -181,13 +181,18 @@ class BeliefPolicyMixin(RememberingMixin):
             values, log_prob, entropy = super().evaluate_actions(attach(obs, belief_pass), actions, *args, **kwargs)
         assert belief_pass.output is not None
         loss = self.belief_loss(belief_pass.output, minibatch)
-        if isinstance(self._extractor, AdaptiveExtractor) and self._extractor.replay:
+        # Not where nothing is trained, as in a measurement, which must draw no random number
+        if isinstance(self._extractor, AdaptiveExtractor) and self._extractor.replay and th.is_grad_enabled():
             assert loss is not None
             loss = loss + self._replayed_loss(self._extractor)
         targets = getattr(obs, "value_targets", None)
         if self.others_baseline is not None and targets is not None:
             assert loss is not None
-            loss = loss + self.baseline_coef * self.others_baseline.loss(belief_pass.features, minibatch, targets)
+            # Its errors count as those of the values do
+            details: Any = self
+            huber_delta = details.value_options and details.value_options.huber_delta
+            error = self.others_baseline.loss(belief_pass.features, minibatch, targets, details.value_unit, huber_delta)
+            loss = loss + self.baseline_coef * error
         return values if loss is None else add_loss(values, loss), log_prob, entropy
 
     def belief_loss(self, belief: BeliefOutput, minibatch: BeliefMinibatch) -> th.Tensor | None:

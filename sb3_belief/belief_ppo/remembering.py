@@ -31,6 +31,11 @@ class RememberingMixin(BeliefNetworksMixin):
         return self._extractor.belief if self.has_belief else None
 
     @property
+    def remembers_waiting(self) -> bool:
+        """Whether it remembers what it sees of the others while it waits for its turn."""
+        return self.has_belief and isinstance(self._extractor, AdaptiveExtractor)
+
+    @property
     def history(self) -> History | None:
         """The history from which the belief is inferred at present, if there is a belief that has one."""
         return self._extractor.history if self.has_belief else None
@@ -51,6 +56,7 @@ class RememberingMixin(BeliefNetworksMixin):
         own_actions: np.ndarray | None = None,
         rewards: np.ndarray | None = None,
         copies: np.ndarray | None = None,
+        acted: np.ndarray | None = None,
     ) -> None:
         """
         Append the agent's own active steps to its history, which is all that it needs to adapt to other teammates.
@@ -59,17 +65,20 @@ class RememberingMixin(BeliefNetworksMixin):
         nothing.
 
         :param observations: Its observations as :meth:`predict` takes them, oldest first, ``[N, ...]``
-        :param actions: What the others did at these steps: ``{name: actions}``, each ``[N, ...]`` in that other's own space,
-            without the others that were not visible at any; or all flattened and side by side, ``[N, W]``, zero where not
-            visible, as in ``info["others_actions"]``
-        :param visible: ``{name: bool [N]}``, at which of the steps each other was visible; at all of them if it is left out.
-            What stands in ``actions`` at the other steps is ignored
-        :param own_actions: What the agent itself did, ``[N, ...]`` in its own space; zeros if it is left out. This and what
-            follows is for the adaptive belief alone
-        :param rewards: Its own rewards, ``[N]``; zeros if they are left out
+        :param actions: What the others did at these steps: ``{name: actions}``, each ``[N, ...]`` in that other's own space
+            (or a single one, where N is 1), without the others that were not visible at any, or with None for them; or all
+            flattened and side by side, ``[N, W]``, zero where not visible, as in ``info["others_actions"]``
+        :param visible: ``{name: bool [N]}``, at which of the steps each other was visible. If it is left out, at all of them,
+            or where its part of ``[N, W]`` is not all zeros. What stands in ``actions`` at the other steps is ignored
+        :param own_actions: What the agent itself did, ``[N, ...]`` in its own space, or a single one where N is 1; zeros if it
+            is left out. This and what follows is for the adaptive belief alone
+        :param rewards: Its own rewards, ``[N]``, or a single one where N is 1; zeros if they are left out. In the unit of its
+            training: normalised if they were then
         :param copies: Where the agent acts in several copies of an environment at once, as in an evaluation: of which copy
             each row is, int ``[N]`` from 0, all of one step. :meth:`predict` takes the i-th of its observations for one of
             copy i. None if these are successive steps of one copy
+        :param acted: In a game in turns, at which of the steps it was the agent's turn, bool ``[N]``: an adaptive belief also
+            remembers what it sees while it waits. At all of them if it is left out
         :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
             is not finite
         """
@@ -84,7 +93,7 @@ class RememberingMixin(BeliefNetworksMixin):
                     "observations to remember hold a number that is not finite: attention to such a row would make all later "
                     "actions NaN; leave these steps out"
                 )
-            encoded = others_rows(self.others_action_spaces, actions, visible, len(rows))
+            encoded, seen = others_rows(self.others_action_spaces, actions, visible, len(rows))
             actions_seen = th.as_tensor(encoded, device=self.device)
             if not isinstance(self._extractor, AdaptiveExtractor):
                 self._extractor.remember(rows, actions_seen)
@@ -93,15 +102,21 @@ class RememberingMixin(BeliefNetworksMixin):
                 copies = np.asarray(copies)
                 if copies.shape != (len(rows),) or copies.dtype.kind != "i" or (copies < 0).any():
                     raise ValueError(f"copies must be integers of at least 0 of the shape {(len(rows),)}, not {copies!r}")
-            own = th.as_tensor(self.own_rows(own_actions, rewards, len(rows)), device=self.device)
-            self._extractor.remember_steps(rows, actions_seen, own, copies)
+            own_rows = self.own_rows(own_actions, rewards, len(rows))
+            if acted is not None:
+                if np.shape(acted) != (len(rows),) or np.asarray(acted).dtype != bool:
+                    raise ValueError(f"acted must be one truth value for each of the {len(rows)} steps, not {acted!r}")
+                own_rows[~np.asarray(acted), :-1] = 0.0
+            own = th.as_tensor(own_rows, device=self.device)
+            anybody = th.as_tensor(seen.any(axis=1), device=self.device)
+            self._extractor.remember_steps((rows, actions_seen, own), anybody, copies)
 
     def own_rows(self, actions: np.ndarray | None, rewards: np.ndarray | None, n_steps: int) -> np.ndarray:
         """
         Return the agent's own part of some steps, as an adaptive belief remembers it.
 
-        :param actions: Its actions, ``[N, ...]``; None for zeros
-        :param rewards: Its rewards, ``[N]``; None for zeros
+        :param actions: Its actions, ``[N, ...]``, or a single one where N is 1; None for zeros
+        :param rewards: Its rewards, ``[N]``, or a single one where N is 1; None for zeros
         :param n_steps: ``N``
         :return: float32 ``[N, U + 1]``
         :raises ValueError: If one of them has another shape, or is not finite
@@ -115,6 +130,8 @@ class RememberingMixin(BeliefNetworksMixin):
             if given is None:
                 continue
             values = np.asarray(given)
+            if n_steps == 1 and values.shape == shape[1:]:
+                values = values[None]
             if values.shape != shape or not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite numbers of the shape {shape}, not {values!r}")
             own[:, columns] = encoder(values) if name == "own_actions" else values[:, None]
@@ -124,10 +141,24 @@ class RememberingMixin(BeliefNetworksMixin):
         """
         Tell a deployed agent that an episode has ended: what follows is another one. Only the adaptive belief knows of them.
 
-        :param copies: In which copies, as of :meth:`remember`, int ``[n]``; None for its only one
+        :param copies: In which copies, as of :meth:`remember`, int ``[n]``; None for all in which it acts
         """
         if self.has_belief and isinstance(self._extractor, AdaptiveExtractor):
-            self._extractor.end_episodes(np.zeros(1, dtype=int) if copies is None else copies)
+            self._extractor.end_episodes(copies)
+
+    def memory_state(self) -> dict[str, th.Tensor]:
+        """Return all that is remembered, for :meth:`restore_memory_state`; empty for a belief without a history."""
+        buffers = dict(self._extractor.named_buffers(recurse=False)) if self.has_belief else {}
+        return {name: rows for name, rows in buffers.items() if name.startswith("history_")}
+
+    def restore_memory_state(self, state: Mapping[str, th.Tensor]) -> None:
+        """
+        Put back what was remembered, with how much time has passed since.
+
+        :param state: As :meth:`memory_state` returned it
+        """
+        for name, rows in state.items():
+            setattr(self._extractor, name, rows)
 
     def flat_observations(self, observations: PyTorchObs) -> th.Tensor:
         """

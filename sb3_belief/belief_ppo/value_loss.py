@@ -119,15 +119,22 @@ def value_loss(values: th.Tensor, targets: ValueTargets, std: th.Tensor | float,
     :param options: The options
     :return: A scalar
     """
-    losses = _losses((targets.returns - values) / std, options.huber_delta)
+    losses = losses_of((targets.returns - values) / std, options.huber_delta)
     if options.value_clip is not None:
         most = options.value_clip * th.as_tensor(std, device=values.device)
         stopped = targets.old_values + (values - targets.old_values).clamp(-most, most)
-        losses = th.max(losses, _losses((targets.returns - stopped) / std, options.huber_delta))
+        losses = th.max(losses, losses_of((targets.returns - stopped) / std, options.huber_delta))
     return losses.mean()
 
 
-def _losses(errors: th.Tensor, huber_delta: float | None) -> th.Tensor:
+def losses_of(errors: th.Tensor, huber_delta: float | None) -> th.Tensor:
+    """
+    Return the loss of each error.
+
+    :param errors: In their unit, ``[B]``
+    :param huber_delta: Where the loss becomes linear; None for the square
+    :return: ``[B]``
+    """
     if huber_delta is None:
         return errors.square()
     return F.huber_loss(errors, th.zeros_like(errors), reduction="none", delta=huber_delta)

@@ -171,10 +171,21 @@ class Meeting:
         """
         seed, memory = play.episodes_seed(repetition), memory or {}
         witness = _Witness(self.env, self.team, self.agents, self.told, memory)
+        policies: list[Any] = [self.team.agents[agent].policy for agent in self.observers]
+        states = [policy.memory_state() for policy in policies]
+        for policy in policies:
+            # What is evaluated are other episodes than that which has been observed
+            policy.end_episodes()
         self.env.seed(seed)
-        with RngSwitch(RngState(seed)):
-            outcome = evaluate(_Remembering(self.model, memory, self.env.num_envs), witness, play.episodes, play.deterministic)
-        return Measured(outcome, *witness.accuracy())
+        try:
+            with RngSwitch(RngState(seed)):
+                outcome = evaluate(
+                    _Remembering(self.model, memory, self.env.num_envs), witness, play.episodes, play.deterministic
+                )
+            return Measured(outcome, *witness.accuracy())
+        finally:
+            for policy, state in zip(policies, states, strict=True):
+                policy.restore_memory_state(state)
 
     def adapt(self, checkpoints: Sequence[int], play: Play, repetition: int) -> dict[int, Measured]:
         """

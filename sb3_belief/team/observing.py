@@ -19,12 +19,13 @@ from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 
 class _Seen(NamedTuple):
     """
-    What an agent observed of a step: its observations when it acted, the others' actions ``[n, W]``, where it acted, its own
-    actions and rewards, and where its return has ended.
+    What an agent observed of a step: its observations when it acted, the others' actions ``[n, W]``, whether each was visible
+    ``[n, n_others]``, where it acted, its own actions and rewards, and where its return has ended.
     """
 
     obs: Any
     others_actions: np.ndarray
+    others_visible: np.ndarray
     active: np.ndarray
     actions: np.ndarray
     rewards: np.ndarray
@@ -52,6 +53,8 @@ class ObservingVecEnv(VecEnvWrapper):
         self.steps = dict.fromkeys(policies, 0)
         #: Whether steps are observed; set to False to go on without
         self.is_open = True
+        # In which copies the return of each agent goes on, so that it waits for its turn where it is not in play
+        self._goes_on = {agent: np.zeros(venv.num_envs, dtype=bool) for agent in policies}
         self._obs: Any = None
         self._actions: Any = None
 
@@ -62,6 +65,8 @@ class ObservingVecEnv(VecEnvWrapper):
         :return: As of the environment within
         """
         self._obs = self.venv.reset()
+        for goes_on in self._goes_on.values():
+            goes_on[:] = False
         return self._obs
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -89,20 +94,27 @@ class ObservingVecEnv(VecEnvWrapper):
         """Return what each agent observed of a step."""
 
     def _remember(self, agent: str, seen: _Seen) -> None:
-        rows = np.flatnonzero(seen.active)
+        policy, active, goes_on = self._policies[agent], np.flatnonzero(seen.active), self._goes_on[agent]
         if self.most_steps is not None:
-            rows = rows[: self.most_steps - self.steps[agent]]
+            active = active[: self.most_steps - self.steps[agent]]
+        rows = active
+        if policy.remembers_waiting and (self.most_steps is None or self.steps[agent] < self.most_steps):
+            rows = np.union1d(active, np.flatnonzero(goes_on & ~seen.active & seen.others_visible.any(axis=1)))
         if len(rows):
-            self._policies[agent].remember(
+            policy.remember(
                 map_parts(lambda part: part[rows], seen.obs),
                 seen.others_actions[rows],
+                dict(zip(policy.others_action_spaces, seen.others_visible[rows].T, strict=True)),
                 own_actions=seen.actions[rows],
+                acted=seen.active[rows],
                 rewards=seen.rewards[rows],
                 copies=rows,
             )
-            self.steps[agent] += len(rows)
+            self.steps[agent] += len(active)
+        goes_on |= seen.active
+        goes_on &= ~seen.dones
         if seen.dones.any():
-            self._policies[agent].end_episodes(np.flatnonzero(seen.dones))
+            policy.end_episodes(np.flatnonzero(seen.dones))
 
 
 class _ObservingTeam(ObservingVecEnv):
@@ -121,7 +133,7 @@ class _ObservingTeam(ObservingVecEnv):
             own = transitions[agent]
             obs, did = self._team.observed_by(agent, self._obs[agent]), np.asarray(self._actions[agent])
             rewards = self._team.rewarded_by(agent, own.rewards)
-            seen[agent] = _Seen(obs, own.others_actions, own.active, did, rewards, own.dones)
+            seen[agent] = _Seen(obs, own.others_actions, own.others_visible, own.active, did, rewards, own.dones)
         return seen
 
 
@@ -130,12 +142,13 @@ class _ObservingLearner(ObservingVecEnv):
         _, rewards, dones, infos = step
         try:
             others_actions = np.stack([info["others_actions"] for info in infos])
+            others_visible = np.stack([info["others_visible"] for info in infos])
             active = np.array([info["active"] for info in infos])
         except KeyError as error:
             raise ValueError(
                 f"The infos of the environment lack {error.args[0]!r}, so there is nothing to observe: use an AgentEnv."
             ) from None
-        seen = _Seen(self._obs, others_actions, active, np.asarray(self._actions), rewards, dones)
+        seen = _Seen(self._obs, others_actions, others_visible, active, np.asarray(self._actions), rewards, dones)
         return dict.fromkeys(self._policies, seen)
 
 
@@ -181,8 +194,8 @@ def observing(
     else:
         raise TypeError(f"A Team or an SB3 model can observe, not a {type(model).__name__}.")
     policies = {agent: each.policy for agent, each in models.items() if isinstance(each.policy, BeliefPolicyMixin)}
-    histories = {agent: policy.history for agent, policy in policies.items()}
-    policies = {agent: policy for agent, policy in policies.items() if histories[agent] is not None}
+    memories = {agent: policy.memory_state() for agent, policy in policies.items()}
+    policies = {agent: policy for agent, policy in policies.items() if memories[agent]}
     if not policies:
         found = ", ".join(f"{agent}: {type(each).__name__}" for agent, each in models.items())
         raise ValueError(
@@ -199,6 +212,4 @@ def observing(
     finally:
         observed.is_open = False
         for agent, policy in policies.items():
-            history = histories[agent]
-            assert history is not None
-            policy.restore_history(history)
+            policy.restore_memory_state(memories[agent])

@@ -45,9 +45,18 @@ class Kept(BaseCallback):
                 "frozen": valid_rows(model.policy.history),
                 "selected": buffer.selected.copy(),
                 "stamps": buffer.stamps.copy(),
-                "valid": buffer.active & buffer.attended_visible.any(axis=-1),
+                "valid": (buffer.active | waits(buffer.active, buffer.episode_starts)) & buffer.attended_visible.any(axis=-1),
             }
         )
+
+
+def waits(active, starts):
+    """Where an agent is out of play within a return in which it has acted."""
+    result = np.zeros_like(active)
+    for t, copy in zip(*np.nonzero(~active), strict=True):
+        first = max((s for s in range(t + 1) if starts[s, copy]), default=0)
+        result[t, copy] = active[first:t, copy].any()
+    return result
 
 
 @pytest.mark.parametrize("inactive", [0, 3])
@@ -200,8 +209,16 @@ def test_memories_differ_by_copy():
     length = int(policy.history.valid.sum())
     assert length - 2 in first[:3] and length - 1 not in first[:3]
     assert length - 1 in second[:3] and length - 2 not in second[:3]
-    # A copy of which nothing is remembered is taken for the first one
-    assert np.array_equal(first, third)
+    # Of a copy in which nobody was seen yet there is nothing
+    assert (third[:3] == -1).all() and (third[3:] >= 0).any()
+
+
+def test_an_agent_that_has_acted_in_one_copy_may_be_evaluated_in_many():
+    model = adaptive().learn(2 * ROLLOUT)
+    obs = observations_of(model, 1)
+    model.policy.remember(obs, {"b": 1})
+    rows = model.policy.predict_others(np.repeat(obs, 3, axis=0)).rows
+    assert (rows == rows[0]).all() and int(model.policy.history.valid.sum()) - 1 in rows[0, :3]
 
 
 def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
@@ -215,14 +232,19 @@ def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
     policy.remember(obs[:1], {"c": 3})
     rows = valid_rows(policy.history)
     assert rows.stamps[-4:].tolist() == [
-        *([clock + i, DEPLOYED, -1] for i in range(3)),
+        *([clock + i, DEPLOYED, -1] for i in range(2)),
+        # The last of its episode
+        [clock + 2, DEPLOYED, -2],
         [clock + 3, DEPLOYED, clock + 3],
     ]
     assert rows.own[-4:].tolist() == [[0, 0, 1, 0.5], [1, 0, 0, 0], [0, 1, 0, -1], [0, 0, 0, 0]]
     assert rows.actions[-4:].argmax(dim=1).tolist() == [0, 1, 2, 6]
-    # A step at which nobody was seen says nothing
-    policy.remember(obs[:1], {})
-    assert int(policy.history.valid.sum()) == len(rows.valid)
+    # A step at which nobody was seen says nothing, but it has passed
+    policy.remember(obs[:1], {"b": None})
+    assert int(policy.history.valid.sum()) == len(rows.valid) and policy.features_extractor.clock == clock + 5
+    # Single actions and rewards
+    policy.remember(obs[:1], {"c": 0}, own_actions=2, rewards=0.25)
+    assert valid_rows(policy.history).own[-1].tolist() == [0, 0, 1, 0.25]
     policy.restore_history(before)
     assert policy.features_extractor.clock == clock
 
@@ -235,6 +257,7 @@ def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
         (dict(rewards=np.array([np.nan])), r"rewards must be finite"),
         (dict(copies=np.zeros(2, dtype=int)), r"copies must be .* shape \(1,\)"),
         (dict(copies=np.array([-1])), r"copies must be"),
+        (dict(acted=[1]), r"acted must be one truth value for each of the 1 steps"),
     ],
 )
 def test_what_cannot_be_remembered_is_refused(kwargs, message):
@@ -265,13 +288,22 @@ def test_wrong_arguments(kwargs, message):
         adaptive(**kwargs)
 
 
-def test_a_saved_model_goes_on_as_it_would_have(tmp_path):
-    model = adaptive(row_features=["age", "copy"], history_dropout=0.1).learn(2 * ROLLOUT)
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_saved_model_goes_on_as_it_would_have(tmp_path, ends):
+    model = adaptive(row_features=["age", "episode", "copy"], history_dropout=0.1).learn(2 * ROLLOUT)
+    for _ in range(2):
+        # Saved in the middle of an episode, or between two; after a step in which nobody was seen
+        model.policy.remember(observations_of(model, 3), {"b": np.array([0, 1, 2])}, copies=np.arange(3))
+        model.policy.remember(observations_of(model, 1), {}, copies=np.zeros(1, dtype=int))
+        model.policy.end_episodes(np.arange(2 + ends))
     model.save(tmp_path / "model.zip")
     loaded = BeliefPPO.load(tmp_path / "model.zip", device="cpu")
     assert same_parameters(model, loaded)
-    assert model.policy.options.row_features == ("age", "copy") and loaded.policy.options == model.policy.options
+    assert model.policy.options.row_features == ("age", "episode", "copy") and loaded.policy.options == model.policy.options
     obs = observations_of(model, 4)
+    stamps = model.policy.features_extractor.present_stamps(4)
+    assert th.equal(stamps, loaded.policy.features_extractor.present_stamps(4))
+    assert stamps[2, 2] == (stamps[1, 2] if ends else -1)
     assert np.array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
     for name, expected in model.policy.predict_others(obs).actions.items():
         assert np.array_equal(expected, loaded.policy.predict_others(obs).actions[name])
