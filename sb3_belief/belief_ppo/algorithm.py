@@ -257,15 +257,19 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
     def remembered(self, first: int, last: int) -> Memory:
         """
         Return steps of the present rollout as an adaptive belief remembers them: those in which the agent acted or waited for
-        its turn, and saw another one act.
+        its turn, and saw another one act. What it observes while it waits is that of its last turn, since what an environment
+        shows of a step out of play may be anything.
 
         :param first: Number of the first step in the rollout
         :param last: Number of the step after the last one
         :return: ``(last - first) * n_envs`` rows, those of all copies at each step
         """
         buffer, policy = self.rollout_buffer, self.policy
-        rows = buffer.rows_of(np.arange(first * self.n_envs, last * self.n_envs))
-        flat = policy.flat_observations(rollout_rows(buffer.observations, rows, policy.device))
+        steps = np.arange(first * self.n_envs, last * self.n_envs)
+        rows = buffer.rows_of(steps)
+        waited = buffer.waited[rows].reshape(-1)
+        turns = np.where(waited > 0, (waited - 1) * self.n_envs + steps % self.n_envs, steps)
+        flat = policy.flat_observations(rollout_rows(buffer.observations, buffer.rows_of(turns), policy.device))
         actions, active = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ())), buffer.active[rows]
         if isinstance(self.action_space, spaces.Box):
             # As the environment got them
@@ -273,7 +277,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
         own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
         # Whoever waits does nothing
         own[~active, :-1] = 0.0
-        valid = (active | buffer.waited[rows]) & buffer.attended_visible[rows].any(axis=1)
+        valid = (active | (buffer.waited[rows] > 0)) & buffer.attended_visible[rows].any(axis=1)
         parts = buffer.attended_actions[rows], own, buffer.stamps[rows], valid
         return Memory(flat, *(th.as_tensor(part, device=policy.device) for part in parts))
 

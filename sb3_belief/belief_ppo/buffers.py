@@ -193,7 +193,8 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
         # As they are attended to: what is seen of others while the agent waits is a row of its own there
         self.attended_actions = np.zeros((*rows, self._widths["others_actions"] if self._is_online else 0), dtype=np.float32)
         self.attended_visible = np.zeros((*rows, self._widths["others_visible"] if self._is_online else 0), dtype=bool)
-        self.waited = np.zeros(rows if self._is_online else (*rows, 0), dtype=bool)
+        # Where the agent waited, the number of its turn before that, from 1; else 0
+        self.waited = np.zeros(rows if self._is_online else (*rows, 0), dtype=np.int32)
         #: What the rewards of the step that is added next have been raised by, which the agent has not got
         self.bootstraps = np.zeros(self.n_envs, dtype=np.float32)
         # Within a rollout all steps attend to equally many rows; the number grows with the history from one to the next
@@ -226,7 +227,7 @@ class BeliefBufferMixin(ActiveStepsBufferMixin):
             self.others_visible[row] |= new
             self.others_actions[row] += self.others_actions[self.pos, copy] * new[owners]
             if self._is_online:
-                self.waited[self.pos, copy] = True
+                self.waited[self.pos, copy] = played[-1] + 1
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """

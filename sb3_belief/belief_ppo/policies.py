@@ -156,7 +156,11 @@ class BeliefPolicyMixin(RememberingMixin):
         # SB3 asks for the values of the observations after a rollout, in all copies
         if self.online is not None and value is None and _n_rows(obs) == len(self.online.stamps()):
             obs = attach(obs, BeliefPass(acts=True))
-        return super().predict_values(obs)
+        if not isinstance(attached(obs), BeliefPass):
+            return super().predict_values(obs)
+        # As SB3, which passes over the extract_features() of its subclasses here
+        features = self.extract_features(obs, self.vf_features_extractor)
+        return self.value_net(self.mlp_extractor.forward_critic(features))
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         """

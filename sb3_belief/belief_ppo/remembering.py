@@ -78,7 +78,7 @@ class RememberingMixin(BeliefNetworksMixin):
             each row is, int ``[N]`` from 0, all of one step. :meth:`predict` takes the i-th of its observations for one of
             copy i. None if these are successive steps of one copy
         :param acted: In a game in turns, at which of the steps it was the agent's turn, bool ``[N]``: an adaptive belief also
-            remembers what it sees while it waits. At all of them if it is left out
+            remembers what it sees while it waits, with its observation at its last turn. At all of them if it is left out
         :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
             is not finite
         """

@@ -55,6 +55,8 @@ class ObservingVecEnv(VecEnvWrapper):
         self.is_open = True
         # In which copies the return of each agent goes on, so that it waits for its turn where it is not in play
         self._goes_on = {agent: np.zeros(venv.num_envs, dtype=bool) for agent in policies}
+        # What each agent observed at its last turn in each copy
+        self._at_turn: dict[str, Any] = {}
         self._obs: Any = None
         self._actions: Any = None
 
@@ -95,6 +97,8 @@ class ObservingVecEnv(VecEnvWrapper):
 
     def _remember(self, agent: str, seen: _Seen) -> None:
         policy, active, goes_on = self._policies[agent], np.flatnonzero(seen.active), self._goes_on[agent]
+        before = self._at_turn.get(agent, seen.obs)
+        self._at_turn[agent] = map_parts(lambda *parts: _of_rows(seen.active, *parts), seen.obs, before)
         if self.most_steps is not None:
             active = active[: self.most_steps - self.steps[agent]]
         rows = active
@@ -102,7 +106,7 @@ class ObservingVecEnv(VecEnvWrapper):
             rows = np.union1d(active, np.flatnonzero(goes_on & ~seen.active & seen.others_visible.any(axis=1)))
         if len(rows):
             policy.remember(
-                map_parts(lambda part: part[rows], seen.obs),
+                map_parts(lambda part: part[rows], self._at_turn[agent]),
                 seen.others_actions[rows],
                 dict(zip(policy.others_action_spaces, seen.others_visible[rows].T, strict=True)),
                 own_actions=seen.actions[rows],
@@ -115,6 +119,11 @@ class ObservingVecEnv(VecEnvWrapper):
         goes_on &= ~seen.dones
         if seen.dones.any():
             policy.end_episodes(np.flatnonzero(seen.dones))
+
+
+def _of_rows(chosen: np.ndarray, there: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return the chosen rows of one array, and the rest of another."""
+    return np.where(chosen.reshape(-1, *[1] * (np.ndim(there) - 1)), there, otherwise)
 
 
 class _ObservingTeam(ObservingVecEnv):

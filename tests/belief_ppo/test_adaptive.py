@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_belief.belief.adaptive import AdaptiveBelief
 from sb3_belief.belief.memory import DEPLOYED, valid_rows
 from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.belief_ppo.adaptive import replayed
@@ -249,6 +251,82 @@ def test_a_deployed_agent_remembers_steps_episodes_and_rewards():
     assert policy.features_extractor.clock == clock
 
 
+def test_an_action_of_zeros_is_seen():
+    model = adaptive(env_kwargs=dict(others={"b": spaces.MultiBinary(2), "c": spaces.Box(-1, 1, (1,), np.float32)}))
+    policy, obs = model.policy, observations_of(model, 1)
+    policy.remember(obs, {"b": np.zeros((1, 2))})
+    policy.remember(obs, np.zeros((1, 3)), {"c": np.array([True]), "b": np.array([False])})
+    assert int(policy.history.valid.sum()) == 2
+    # Without a word on who was visible, rows of zeros say that nobody was
+    policy.remember(obs, np.zeros((1, 3)))
+    assert int(policy.history.valid.sum()) == 2
+
+
+def test_own_actions_are_remembered_as_the_environment_got_them():
+    model = adaptive(env_kwargs=dict(action_space=spaces.Box(-0.5, 0.5, (2,), np.float32), visible=1.0)).learn(ROLLOUT)
+    buffer = model.rollout_buffer
+    assert abs(buffer.actions).max() > 0.5
+    own = model.policy.history.own[:, :-1]
+    assert own.abs().max() == 0.5 and len({*own.flatten().tolist()}) > 10
+
+
+def test_what_a_row_does_not_tell_changes_nothing():
+    """Through the arguments of BeliefPPO: the reward of a remembered step, and whether it is of the same episode."""
+    for features, name in (([], "reward"), (["reward"], "episode"), (["reward", "episode"], None)):
+        model = adaptive(row_features=features).learn(2 * ROLLOUT)
+        policy, obs = model.policy, observations_of(model, 4)
+        policy.remember(obs, {"b": np.arange(4) % 3}, copies=np.arange(4))
+
+        def found(policy=policy, obs=obs):
+            return policy.predict_others(obs).mean
+
+        before, history = found(), policy.history
+        policy.restore_history(history._replace(own=history.own + th.tensor([0.0, 0.0, 0.0, 1.0])))
+        assert np.array_equal(found(), before) == (name == "reward")
+        policy.restore_history(history)
+        policy.end_episodes()
+        assert np.array_equal(found(), before) == (name in ("reward", "episode"))
+
+
+def test_values_attend_to_the_rollout_as_acting_does(monkeypatch):
+    """Those of the last observations, and those at time limits, not to the history from before it."""
+    asked: list[tuple[int, int]] = []
+    forward = AdaptiveBelief.forward
+
+    def spied(self, observations, stamps, memory, *args, **kwargs):
+        if not th.is_grad_enabled():
+            asked.append((len(observations), len(memory.valid)))
+        return forward(self, observations, stamps, memory, *args, **kwargs)
+
+    monkeypatch.setattr(AdaptiveBelief, "forward", spied)
+    adaptive(history_length=4, n_epochs=1, n_envs=2).learn(2 * N_STEPS * 2, callback=(rollouts := AtRollouts(asked)))
+    assert len(rollouts.spans) == 2
+    for begin, end in rollouts.spans:
+        frozen = asked[begin][1]
+        assert (frozen > 0) == (begin > 0)
+        # All copies at each step, once more where the episodes of both end, and the observations after the last step
+        steps = [t for t in range(N_STEPS) for _ in range(2 if t % 7 == 6 else 1)]
+        assert asked[begin:end] == [(2, frozen + 2 * t) for t in [*steps, N_STEPS]]
+
+
+class AtRollouts(BaseCallback):
+    """Callback that notes which of the entries of a list were added in each rollout."""
+
+    def __init__(self, entries: list[Any]) -> None:
+        super().__init__()
+        self.entries = entries
+        self.spans: list[tuple[int, int]] = []
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.begin = len(self.entries)
+
+    def _on_rollout_end(self) -> None:
+        self.spans.append((self.begin, len(self.entries)))
+
+
 @pytest.mark.parametrize(
     "kwargs, message",
     [
@@ -301,9 +379,9 @@ def test_a_saved_model_goes_on_as_it_would_have(tmp_path, ends):
     assert same_parameters(model, loaded)
     assert model.policy.options.row_features == ("age", "episode", "copy") and loaded.policy.options == model.policy.options
     obs = observations_of(model, 4)
-    stamps = model.policy.features_extractor.present_stamps(4)
-    assert th.equal(stamps, loaded.policy.features_extractor.present_stamps(4))
-    assert stamps[2, 2] == (stamps[1, 2] if ends else -1)
+    extractors: list[Any] = [each.policy.features_extractor for each in (model, loaded)]
+    there, here = (each.present_stamps(4) for each in extractors)
+    assert th.equal(there, here) and there[2, 2] == (there[1, 2] if ends else -1)
     assert np.array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
     for name, expected in model.policy.predict_others(obs).actions.items():
         assert np.array_equal(expected, loaded.policy.predict_others(obs).actions[name])

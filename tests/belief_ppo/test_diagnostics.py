@@ -84,10 +84,11 @@ def test_the_measured_losses_are_those_that_are_trained():
     assert losses[-1].item() == pytest.approx(0.25 * measured["action_loss"] + 0.125 * measured["kl"], rel=1e-5)
 
 
-def test_measuring_changes_nothing(monkeypatch):
-    measured = make_model().learn(3 * ROLLOUT)
+@pytest.mark.parametrize("kwargs", [{}, dict(belief="adaptive", belief_replay=2, history_dropout=0.1)], ids=str)
+def test_measuring_changes_nothing(monkeypatch, kwargs):
+    measured = make_model(**kwargs).learn(3 * ROLLOUT)
     monkeypatch.setattr(algorithm, "measure_belief", lambda policy, buffer: {})
-    unmeasured = make_model().learn(3 * ROLLOUT)
+    unmeasured = make_model(**kwargs).learn(3 * ROLLOUT)
     assert measured_of(measured) and not measured_of(unmeasured)
     assert same_parameters(measured, unmeasured)
 

@@ -78,6 +78,7 @@ SWITCHES: list[dict[str, Any]] = [
     dict(similarity="observation"),
     dict(detach_belief=True),
     dict(env_kwargs=dict(inactive=3)),
+    dict(belief="adaptive", env_kwargs=dict(inactive=3), prediction_steps=3, belief_replay=2, critic_sees_others=True),
 ]
 
 

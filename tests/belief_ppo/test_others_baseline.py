@@ -1,5 +1,6 @@
 """The baseline that sees what the others did: its policy gradient is the plain one in expectation, with less variance."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_belief.belief.memory import followed_by, valid_rows
 from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.belief_ppo.buffers import attach
-from sb3_belief.belief_ppo.others_baseline import take_off
+from sb3_belief.belief_ppo.others_baseline import OthersBaseline, take_off
+from sb3_belief.belief_ppo.value_loss import ValueTargets
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, Watch, make_model
 
 # What the agent gets by its own action and the other's, who matters more
@@ -121,7 +123,29 @@ def test_nothing_else_is_trained_by_it(algorithm):
     assert seeing["others_baseline.layers.2.weight"].abs().max() > 0
 
 
+@pytest.mark.parametrize("huber_delta, expected", [(None, (4.0 + 1.0) / 2), (1.0, (1.5 + 0.5) / 2)])
+def test_its_errors_count_as_those_of_the_values(huber_delta, expected):
+    """In units of 10, in which the layers predict as well."""
+    baseline = OthersBaseline(2, 1, "cpu")
+    th.nn.init.constant_(baseline.layers[2].bias, 3.0)  # type: ignore[arg-type]
+    minibatch: Any = SimpleNamespace(seen_at_once=th.zeros(2, 1))
+    targets = ValueTargets(th.tensor([60.0, 30.0]), th.tensor([10.0, -10.0]))
+    assert baseline(th.zeros(2, 2), minibatch.seen_at_once, 10.0).tolist() == [30.0, 30.0]
+    # Advantages of 50 and 40
+    assert baseline.loss(th.zeros(2, 2), minibatch, targets, 10.0, huber_delta).item() == pytest.approx(expected)
+
+
 def test_with_the_options_of_the_value():
-    model = make_model(belief="adaptive", critic_sees_others=True, value_norm=True, huber_delta=10.0).learn(3 * ROLLOUT)
+    model = make_model(belief="adaptive", critic_sees_others=True, value_norm=True, huber_delta=10.0)
+    units: list[Any] = []
+    loss = model.policy.others_baseline.loss
+
+    def spied(*args: Any) -> Any:
+        units.append((float(args[3]), args[4]))
+        return loss(*args)
+
+    model.policy.others_baseline.loss = spied
+    model.learn(3 * ROLLOUT)
     assert model.policy.others_baseline.layers[2].weight.abs().max() > 0
+    assert (float(model.policy.value_unit), 10.0) in units and (1.0, 10.0) not in units
     assert not model.rollout_buffer.shows_targets

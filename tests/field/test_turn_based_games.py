@@ -14,8 +14,10 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief import AgentEnv, BeliefPPO, MaskableBeliefPPO
+from sb3_belief.belief.memory import DEPLOYED, valid_rows
 from sb3_belief.belief_ppo import BeliefRolloutBuffer
 from sb3_belief.envs import check_team_env, to_parallel
+from sb3_belief.team import observing
 from tests.team.helpers import Team, make_team_env
 
 KWARGS: dict[str, Any] = {"n_steps": 24, "batch_size": 24, "n_epochs": 1, "device": "cpu"}
@@ -105,6 +107,45 @@ def test_only_the_one_on_turn_is_active_and_seen():
     # Rows of visible: the others of each player. All who wait see the one whose turn it is
     assert infos[1]["visible"].tolist() == [[True, False], [False, False], [False, True]]
     assert infos[1]["agent_rewards"].tolist() == np.array([0, 0, 0.1], np.float32).tolist()
+
+
+def test_an_adaptive_belief_remembers_what_it_sees_while_it_waits():
+    env = make_team_env(partial(game, n=3, stones=14), n_envs=2)
+    kwargs: dict[str, Any] = {**KWARGS, "belief": "adaptive", "action_loss": "cross_entropy", "history_length": 12}
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_pool=0, critic_sees_others=True, **kwargs)
+    for _ in range(3):
+        team.learn(24 * 2, reset_num_timesteps=False)
+        for model in team.agents.values():
+            assert model.logger.name_to_value["belief/first_log_ratio"] < 1e-5
+    for model in team.agents.values():
+        buffer = model.rollout_buffer
+        # The first get() of the update has put the copies one after the other
+        active, selected = buffer.active.reshape(2, 24), buffer.selected.reshape(2, 24, -1)
+        n_frozen = 12
+        rows = [row - n_frozen for copy, t in np.argwhere(active) for row in selected[copy, t] if row >= n_frozen]
+        assert len(rows) > 12 and not active[[row % 2 for row in rows], [row // 2 for row in rows]].any()
+        # At its own turn nobody else acts, so there is nothing that the baseline could see
+        assert not buffer.belief_minibatch(np.flatnonzero(buffer.active)).seen_at_once.any()
+        # Each row is a move of another player, seen while the agent did nothing
+        history = model.policy.history
+        assert history.valid.all() and (history.actions.sum(dim=1) == 1).all() and not history.own[:, :-1].any()
+        # What the one before pays is paid while the agent waits
+        assert set(history.own[:, -1].tolist()) <= {0.0, np.float32(0.1)} and history.own[:, -1].any()
+
+    def taken(actions: dict[str, Any]) -> dict[str, np.ndarray]:
+        return {agent: np.zeros(2, dtype=int) for agent in actions}
+
+    before = {agent: model.policy.history for agent, model in team.agents.items()}
+    with observing(team, make_team_env(partial(game, n=3, stones=14), n_envs=2)) as watched:
+        watched.reset()
+        for _ in range(5):
+            watched.step(taken(team.agents))  # type: ignore[arg-type]
+        # Moves 0 to 4: of the others after the first of its own
+        for agent, seen in {"player_0": 3, "player_1": 2, "player_2": 2}.items():
+            kept = valid_rows(team.agents[agent].policy.history)
+            deployed = kept.stamps[:, 1] <= DEPLOYED
+            assert deployed.sum() == 2 * seen and not kept.own[deployed, :-1].any()
+    assert all(th.equal(model.policy.history.stamps, before[agent].stamps) for agent, model in team.agents.items())
 
 
 @pytest.mark.parametrize("n_steps", [24, 23])

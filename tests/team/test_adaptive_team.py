@@ -65,9 +65,16 @@ def test_what_is_observed_goes_into_the_memory_of_its_copy(normalize):
     team = learned(48, normalize=normalize)
     before = histories(team)
     env = make_team_env(BlinkingEnv, n_envs=3, seed=5)
+    got: dict[str, set[float]] = {agent: set() for agent in team.agents}
+
+    def note(local: dict[str, Any], _: Any) -> None:
+        for k, agent in enumerate(env.possible_agents):
+            rewards = np.array([local["infos"][local["i"]]["agent_rewards"][k]])
+            got[agent].add(float(np.float32(team.rewarded_by(agent, rewards)[0])))
+
     with observing(team, env) as watched:
-        evaluate_policy(team, watched, n_eval_episodes=6)
-        for model in team.agents.values():
+        evaluate_policy(team, watched, n_eval_episodes=6, callback=note)
+        for agent, model in team.agents.items():
             rows = model.policy.history
             own = rows.own[rows.valid & (rows.stamps[:, 1] < 0)]
             stamps = rows.stamps[rows.valid & (rows.stamps[:, 1] < 0)]
@@ -75,4 +82,6 @@ def test_what_is_observed_goes_into_the_memory_of_its_copy(normalize):
             # Several episodes of each copy, each by its beginning
             assert all(len(set(stamps[stamps[:, 1] == copy, 2].tolist())) > 1 for copy in (-1, -2, -3))
             assert own[:, :-1].any(dim=1).all() and own[:, -1].any()
+            # In the unit of the training
+            assert set(own[:, -1].tolist()) <= got[agent]
     assert histories(team) == before
