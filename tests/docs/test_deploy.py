@@ -10,6 +10,7 @@ import urllib.error
 import urllib.request
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,23 +20,24 @@ from sb3_belief import BeliefPPO, Team, make_team_env
 TEXT = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text(encoding="utf-8")
 
 
-def saved_follower(folder):
+def saved_follower(folder, belief):
     env = make_team_env("convention-swap", n_envs=2, seed=0, env_kwargs={"m": 3})
-    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, n_steps=16, batch_size=16, history_length=40).learn(32)
+    kwargs = {"n_steps": 16, "batch_size": 16, "history_length": 40, "belief": belief}
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **kwargs).learn(32)  # type: ignore[arg-type]
     team.save(folder / "team.zip")
     with zipfile.ZipFile(folder / "team.zip") as archive:
         return archive.extract("agents/follower.zip", folder)
 
 
-@pytest.fixture
-def service(tmp_path):
+@pytest.fixture(params=["dynamic"])
+def service(tmp_path, request):
     """A function that asks the running service, and the agent that it serves."""
     (code,) = re.findall(r"```python\n(# python service.py.*?)```", TEXT, re.DOTALL)
     (tmp_path / "service.py").write_text(code)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    agent = saved_follower(tmp_path)
+    agent = saved_follower(tmp_path, request.param)
     process = subprocess.Popen([sys.executable, tmp_path / "service.py", agent, str(port)])
 
     def ask(path, **body):
@@ -75,3 +77,25 @@ def test_it_predicts_and_remembers_as_the_agent_does(service):
 
     assert "'x' is none of the others" in ask("remember", observations=seen, actions={"x": seen})["error"]
     assert ask("predict", observations=cues.tolist()) == after
+
+
+@pytest.mark.parametrize("service", ["adaptive"], indirect=True)
+def test_an_adaptive_agent_is_told_what_it_did_and_got(service):
+    ask, agent = service
+    cues = np.arange(3)
+    answers = []
+    told: list[dict[str, Any]] = [
+        {"own_actions": [2]},
+        {"own_actions": [0], "rewards": [1.0]},
+        {"visible": {"leader": [False]}},
+    ]
+    for step, more in enumerate(told):
+        body: dict[str, Any] = {"observations": [step], "actions": {"leader": [step]}}
+        ask("remember", **body, **more, episode_ended=step == 1)
+        agent.policy.remember(np.array([step]), body["actions"], **more)
+        if step == 1:
+            agent.policy.end_episodes()
+        answers.append(ask("predict", observations=cues.tolist())["others"]["leader"])
+        np.testing.assert_allclose(answers[-1], agent.policy.predict_others(cues).actions["leader"], rtol=1e-5)
+    assert answers[0] != answers[1]
+    assert "own_actions must be" in ask("remember", observations=[0], actions={}, own_actions=[1, 2])["error"]
