@@ -23,7 +23,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text(encoding="ut
 def saved_follower(folder, belief):
     env = make_team_env("convention-swap", n_envs=2, seed=0, env_kwargs={"m": 3})
     kwargs = {"n_steps": 16, "batch_size": 16, "history_length": 40, "belief": belief}
-    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **kwargs).learn(32)  # type: ignore[arg-type]
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **kwargs).learn(32)
     team.save(folder / "team.zip")
     with zipfile.ZipFile(folder / "team.zip") as archive:
         return archive.extract("agents/follower.zip", folder)
