@@ -182,7 +182,7 @@ def attend_beside_null(
     :return: The weighted sums, ``[B, d]``, and the weights, those of the null row last, ``[B, N + 1]``
     """
     # A sparse matrix has no more entries in a row than columns
-    if not th.is_grad_enabled() or th.compiler.is_compiling() or selected.shape[1] > len(rows):
+    if th.compiler.is_compiling() or selected.shape[1] > len(rows):
         scores = (queries[:, None] * rows[selected.long()]).sum(dim=-1) + bias
         return sum_beside_null(rows, scores, null, selected)
     return _AttendBesideNull.apply(queries, rows, bias, null, selected)

@@ -264,12 +264,13 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
         :param last: Number of the step after the last one
         :return: ``(last - first) * n_envs`` rows, those of all copies at each step
         """
-        buffer, policy = self.rollout_buffer, self.policy
+        # Not the policy's device, which SB3 looks for among all its weights each time
+        buffer, policy, device = self.rollout_buffer, self.policy, self.device
         steps = np.arange(first * self.n_envs, last * self.n_envs)
         rows = buffer.rows_of(steps)
         waited = buffer.waited[rows].reshape(-1)
         turns = np.where(waited > 0, (waited - 1) * self.n_envs + steps % self.n_envs, steps)
-        flat = policy.flat_observations(rollout_rows(buffer.observations, buffer.rows_of(turns), policy.device))
+        flat = policy.flat_observations(rollout_rows(buffer.observations, buffer.rows_of(turns), device))
         actions, active = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ())), buffer.active[rows]
         if isinstance(self.action_space, spaces.Box):
             # As the environment got them
@@ -279,7 +280,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
         own[~active, :-1] = 0.0
         valid = (active | (buffer.waited[rows] > 0)) & buffer.attended_visible[rows].any(axis=1)
         parts = buffer.attended_actions[rows], own, buffer.stamps[rows], valid
-        return Memory(flat, *(th.as_tensor(part, device=policy.device) for part in parts))
+        return Memory(flat, *(th.as_tensor(part, device=device) for part in parts))
 
     def _coefficient(self, name: str) -> float:
         """Return and log the present value of a loss coefficient, which may be a schedule."""
