@@ -67,7 +67,9 @@ class ObservingVecEnv(VecEnvWrapper):
         :return: As of the environment within
         """
         self._obs = self.venv.reset()
-        for goes_on in self._goes_on.values():
+        for agent, goes_on in self._goes_on.items():
+            # Whatever was under way is over
+            self._policies[agent].end_episodes()
             goes_on[:] = False
         return self._obs
 

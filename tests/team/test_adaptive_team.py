@@ -84,4 +84,13 @@ def test_what_is_observed_goes_into_the_memory_of_its_copy(normalize):
             assert own[:, :-1].any(dim=1).all() and own[:, -1].any()
             # In the unit of the training
             assert set(own[:, -1].tolist()) <= got[agent]
+        # An episode that is cut off by a reset is over, too
+        obs = watched.reset()
+        for _ in range(3):
+            obs = watched.step(team.predict(obs)[0])[0]
+        watched.reset()
+        for model in team.agents.values():
+            rows = model.policy.history
+            for _, place, began in model.policy.features_extractor.present_stamps(3).tolist():
+                assert began not in rows.stamps[rows.valid & (rows.stamps[:, 1] == place), 2]
     assert histories(team) == before
