@@ -1,5 +1,7 @@
 """What is exported of an agent: one pass from its observation to the probabilities of its actions, and to its belief."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch as th
@@ -60,7 +62,9 @@ class PolicyGraph(nn.Module):
         policy = model.policy
         policy.set_training_mode(False)
         self.policy = policy
-        self.masked = isinstance(policy, MaskableActorCriticPolicy)
+        # Those of sb3-contrib are given masks after they are made; IAC's, which may have none, before
+        self._masks_before: Callable[[th.Tensor | None], AbstractContextManager[None]] | None = getattr(policy, "masked", None)
+        self.masked = isinstance(policy, MaskableActorCriticPolicy) or getattr(model, "learned_with_masks", False)
         # That of MAPPO observes more in training than it acts by
         self._space = space = getattr(policy, "own_space", policy.observation_space)
         self.observation_names = [f"observation.{key}" for key in space] if isinstance(space, spaces.Dict) else ["observation"]
@@ -123,8 +127,9 @@ class PolicyGraph(nn.Module):
             output = self._extractor.infer_from(self._context, flat)
             features = self._extractor.with_belief(own, output)
             believed = self._believed(output)
-        distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(features))
-        if mask is not None:
+        with self._masks_before(mask) if self._masks_before else nullcontext():
+            distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(features))
+        if mask is not None and not self._masks_before:
             distribution.apply_masking(mask)
         return {**self._action_outputs(distribution), **believed}
 
@@ -169,7 +174,11 @@ class PolicyGraph(nn.Module):
         observation, mask = self._arguments(inputs)
         with th.no_grad():
             outputs = self(*inputs)
-            made = self.policy.get_distribution(observation, *([] if mask is None else [mask]))
+            if self._masks_before:
+                with self._masks_before(mask):
+                    made = self.policy.get_distribution(observation)
+            else:
+                made = self.policy.get_distribution(observation, *([] if mask is None else [mask]))
             for name, expected in self._action_outputs(made).items():
                 if not th.allclose(outputs[name], expected, rtol=1e-3, atol=1e-5):
                     raise ValueError(

@@ -15,10 +15,12 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief import Team, make_team_env
-from sb3_belief.baselines import AMFPPO
+from sb3_belief.baselines import AMFPPO, IAC
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
+from sb3_belief.common.action_masks import mask_parts
 from sb3_belief.export import export_model
 from sb3_belief.references import MAPPO, WithState
+from tests.baselines.test_iac import Unmasked
 from tests.belief_ppo.helpers import SMALL, make_model, observations_of
 from tests.belief_ppo.toy_envs import AmongOthers
 from tests.references.test_mappo import Stateful
@@ -272,3 +274,24 @@ def test_without_onnx_there_is_a_line_that_installs_it(monkeypatch, tmp_path):
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'sb3-belief\[export\]'"):
         export_model(make_model(), tmp_path / "a.onnx", "onnx")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("action_space", [spaces.Discrete(4), spaces.MultiDiscrete([2, 4])], ids=str)
+def test_masks_of_iac_are_an_input_where_it_has_learned_with_them(tmp_path, action_space):
+    for env_class, masked in ((AmongOthers, True), (Unmasked, False)):
+        env = make_vec_env(env_class, n_envs=2, seed=0, env_kwargs=dict(action_space=action_space))
+        model: Any = IAC("MlpPolicy", env, n_steps=8, seed=0, device="cpu").learn(32)
+        export_model(model, tmp_path / "iac.onnx", "onnx")
+        observations = observations_of(model, 6)
+        inputs = {"observation": observations}
+        masks = np.ones((6, sum(mask_parts(action_space))), dtype=bool)
+        masks[::2, 1] = False
+        if masked:
+            inputs["action_mask"] = masks
+        with th.no_grad(), model.policy.masked(masks if masked else None):
+            made = model.policy.get_distribution(th.as_tensor(observations))
+        parts = made.distribution if isinstance(made.distribution, list) else [made.distribution]
+        expected = th.cat([part.probs for part in parts], dim=1).numpy()
+        (found,) = run_onnx(tmp_path / "iac.onnx", inputs).values()
+        np.testing.assert_allclose(found, expected, atol=2e-6, rtol=2e-5)
+        assert (found[::2, 1] == 0).all() == masked
