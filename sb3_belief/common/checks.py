@@ -1,5 +1,7 @@
 """Checks of what a user gives, with messages that name the argument and what is allowed."""
 
+import math
+
 
 def check_integer(name: str, value: object, least: int, meaning: str, most: int | None = None) -> None:
     """
@@ -27,6 +29,19 @@ def check_flag(name: str, value: object) -> None:
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name}={value!r} must be True or False.")
+
+
+def check_positive(name: str, value: object, meaning: str) -> None:
+    """
+    Check an argument that is a number above 0.
+
+    :param name: Name of the argument
+    :param value: What the user gave
+    :param meaning: What the argument is, for the message
+    :raises ValueError: If it is no finite number above 0
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise ValueError(f"{name}={value!r} must be a number above 0: {meaning}.")
 
 
 def check_share(name: str, value: object, meaning: str) -> None:

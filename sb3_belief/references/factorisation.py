@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 
-from sb3_belief.common.checks import check_integer, check_share
+from sb3_belief.common.checks import check_integer, check_positive, check_share
 from sb3_belief.references.agent_net import AgentValues
 from sb3_belief.references.episodes import EpisodeBatch, EpisodeReplayBuffer, lambda_returns
 from sb3_belief.references.factorised_policy import MIXERS, FactorisedPolicy
@@ -87,6 +87,7 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
         check_integer("gradient_steps", gradient_steps, 1, "how many updates there are each time")
         check_integer("target_update_interval", target_update_interval, 1, "the episodes between two target networks")
         check_integer("exploration_steps", exploration_steps, 1, "the steps in which epsilon falls")
+        check_positive("max_grad_norm", max_grad_norm, "the largest norm of a gradient")
         check_share("gamma", gamma, "how much a later reward is worth")
         check_share("td_lambda", td_lambda, "0 for one-step targets, 1 for whole returns")
         check_share("exploration_initial_eps", exploration_initial_eps, "the probability of a random action")

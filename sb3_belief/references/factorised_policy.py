@@ -10,6 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.references.agent_net import AgentNet, AgentValues
 from sb3_belief.references.episodes import EpisodeBatch
 from sb3_belief.references.mixers import QMIX, QPLEX, VDN, Mixer
@@ -94,6 +95,7 @@ class FactorisedPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
+        check_integer("hidden_dim", hidden_dim, 1, "the width of the agents' networks")
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True}
         super().__init__(observation_space, action_space, optimizer_class=optimizer_class, optimizer_kwargs=optimizer_kwargs)

@@ -81,6 +81,9 @@ class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
     ):
         check_integer("batch_size", batch_size, 1, "the joint steps in an update")
         check_integer("gradient_steps", gradient_steps, 1, "how many updates there are each time")
+        check_integer("learning_starts", learning_starts, 0, "the joint steps before the first update")
+        if isinstance(train_freq, int):
+            check_integer("train_freq", train_freq, 1, "the steps between two updates")
         check_share("tau", tau, "the share of the present networks in their targets")
         check_share("gamma", gamma, "how much a later reward is worth")
         for name, value in (("exploration_noise", exploration_noise), ("output_coef", output_coef)):

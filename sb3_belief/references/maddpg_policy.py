@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_belief.common.checks import check_positive
 from sb3_belief.references.mixers import ParallelLinear
 
 
@@ -37,6 +38,7 @@ class MaddpgPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
+        check_positive("temperature", temperature, "of the Gumbel softmax")
         super().__init__(
             observation_space,
             action_space,

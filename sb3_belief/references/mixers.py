@@ -11,6 +11,7 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.references.agent_net import AgentValues
 
 # Keeps what must be positive away from zero, as in the code of QPLEX's authors
@@ -84,6 +85,7 @@ class QMIX(Mixer):
 
     def __init__(self, n_agents: int, n_actions: int, state_dim: int, embedding_dim: int = 32, hypernet_dim: int | None = 64):
         super().__init__(n_agents, n_actions, state_dim)
+        check_integer("embedding_dim", embedding_dim, 1, "the width of the mixing layer")
         self.embedding_dim = embedding_dim
         self.w1 = _hypernet(state_dim, n_agents * embedding_dim, hypernet_dim)
         self.b1 = nn.Linear(state_dim, embedding_dim)

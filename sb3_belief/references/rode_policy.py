@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_belief.common.checks import check_integer
 from sb3_belief.references.agent_net import AgentNet, AgentValues
 from sb3_belief.references.episodes import EpisodeBatch
 from sb3_belief.references.factorised_policy import FactorisedPolicy, explore
@@ -88,6 +89,8 @@ class RodePolicy(FactorisedPolicy):
         n_actions = observation_space["mask"].shape[1]  # type: ignore[index]
         if not 1 <= n_roles <= n_actions:
             raise ValueError(f"n_roles={n_roles!r} must be from 1 to {n_actions}, the number of actions, which are grouped.")
+        check_integer("role_interval", role_interval, 1, "the steps for which a role is kept")
+        check_integer("embedding_dim", embedding_dim, 1, "the width of an embedding")
         self.n_roles, self.role_interval, self.embedding_dim = n_roles, role_interval, embedding_dim
         super().__init__(
             observation_space,
