@@ -6,6 +6,8 @@ import torch as th
 
 #: The first copy of an environment in which an agent that does not train acts; the next ones are -2, -3, ...
 DEPLOYED = -1
+#: In place of the step with which an episode began, of the first one of such a copy
+FIRST_EPISODE = -1
 
 
 class Memory(NamedTuple):
@@ -16,7 +18,8 @@ class Memory(NamedTuple):
     :param actions: The others' actions at the same steps, flattened and side by side, zero where not visible, float ``[T, W]``
     :param own: Its own flattened action and its own reward, float ``[T, U + 1]``
     :param stamps: When and where: number of the step, of the copy of the environment (negative outside of training), and of
-        the step with which its episode began, int64 ``[T, 3]``
+        the step with which its episode began, int64 ``[T, 3]``. Outside of training that is ``FIRST_EPISODE`` for the first
+        one, and below it in the last row of an episode that has ended
     :param valid: Whether a row holds a step in which the agent was active and saw another one act, bool ``[T]``
     """
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_belief.belief import ActionLayout, BeliefOutput, expected_actions
 from sb3_belief.belief.adaptive import AdaptiveBelief, EncodedMemory
-from sb3_belief.belief.memory import DEPLOYED, Memory, empty_memory, followed_by, newest, valid_rows
+from sb3_belief.belief.memory import DEPLOYED, FIRST_EPISODE, Memory, empty_memory, followed_by, newest, valid_rows
 from sb3_belief.belief_ppo.buffers import BeliefMinibatch
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, BeliefFeatures, BeliefPass
 from sb3_belief.belief_ppo.options import BeliefOptions
@@ -122,7 +122,7 @@ class AdaptiveExtractor(BeliefExtractor):
         if copies is not None:
             times, places = np.full(n, now), DEPLOYED - copies
         episodes = self._episodes()
-        stamps = np.stack([times, places, [episodes.get(int(place), -1) for place in places]], axis=1)
+        stamps = np.stack([times, places, [episodes.get(int(place), FIRST_EPISODE) for place in places]], axis=1)
         after = now + (n if copies is None else 1)
         n_copies = max(self.n_copies, 1 if copies is None else int(copies.max(initial=0)) + 1)
         self.append(Memory(*rows, th.as_tensor(stamps), visible), after, n_copies)
@@ -145,7 +145,7 @@ class AdaptiveExtractor(BeliefExtractor):
     def _episodes(self) -> dict[int, int]:
         """Return the step with which the present episode began of each copy outside of training of which there is a row."""
         deployed = self.history_stamps[self.history_valid & (self.history_stamps[:, 1] <= DEPLOYED)]
-        return {place: now + 1 if began < DEPLOYED else began for now, place, began in deployed.tolist()}
+        return {place: now + 1 if began < FIRST_EPISODE else began for now, place, began in deployed.tolist()}
 
     def present_stamps(self, n: int) -> th.Tensor:
         """
@@ -157,7 +157,7 @@ class AdaptiveExtractor(BeliefExtractor):
         """
         now, episodes = self.clock, self._episodes()
         places = [DEPLOYED - copy if self.n_copies > 1 else DEPLOYED for copy in range(n)]
-        rows = [(now, place, episodes.get(place, -1)) for place in places]
+        rows = [(now, place, episodes.get(place, FIRST_EPISODE)) for place in places]
         return th.tensor(rows, dtype=th.int64, device=self.history_stamps.device).reshape(n, 3)
 
     def believe(self, flat: th.Tensor, belief_pass: BeliefPass) -> BeliefOutput:
@@ -212,8 +212,8 @@ class AdaptiveExtractor(BeliefExtractor):
 
 
 def _ended(began: th.Tensor) -> th.Tensor:
-    """Mark the last row of an episode: by a number that no episode has, of which the one it began with can be told."""
-    return th.where(began < DEPLOYED, began, 2 * DEPLOYED - 1 - began)
+    """Mark the last row of an episode, by a number that no episode has: -2 in place of -1, -3 of 0, -4 of 1, ..."""
+    return th.where(began < FIRST_EPISODE, began, 2 * FIRST_EPISODE - 1 - began)
 
 
 class Replayed(NamedTuple):
