@@ -76,7 +76,7 @@ def test_copies_without_a_seed_differ():
 @pytest.mark.parametrize(
     "kwargs, says",
     [
-        ({"redraw_every": 0}, "redraw_every, redraw_unit, per_copy and partner_seed are no schedule: every=0 must be"),
+        ({"redraw_every": 0}, "redraw_every, redraw_unit, per_copy and partner_seed are no schedule: redraw_every=0 must be"),
         ({"redraw_unit": "steps"}, "unit='steps' is not one of 'rollouts', 'episodes'"),
         ({"redraw_unit": "episodes"}, "needs per_copy=True"),
         ({"partner_seed": -1}, "seed=-1 must be an integer >= 0"),
