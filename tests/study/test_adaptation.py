@@ -49,9 +49,9 @@ def test_steps_are_counted_and_nothing_else_changes(teams, tmp_path, monkeypatch
     remembered, states = [], []
     remember, measure = BeliefPolicyMixin.remember, meetings.Meeting.measure
 
-    def counted(policy, observations, actions, **kwargs):
+    def counted(policy, observations, actions, *args, **kwargs):
         remembered.append(len(actions))
-        remember(policy, observations, actions, **kwargs)
+        remember(policy, observations, actions, *args, **kwargs)
 
     def spied(meeting, play, repetition, memory=None):
         weights = {name: value.detach().clone() for name, value in meeting.team.agents["car_1"].policy.named_parameters()}
