@@ -20,7 +20,8 @@ class Memory(NamedTuple):
     :param stamps: When and where: number of the step, of the copy of the environment (negative outside of training), and of
         the step with which its episode began, int64 ``[T, 3]``. Outside of training that is ``FIRST_EPISODE`` for the first
         one, and below it in the last row of an episode that has ended
-    :param valid: Whether a row holds a step in which the agent was active and saw another one act, bool ``[T]``
+    :param valid: Whether a row holds a step in which the agent was active, or waited for its turn, and saw another one act,
+        bool ``[T]``
     """
 
     observations: th.Tensor

@@ -75,11 +75,14 @@ class AdaptiveExtractor(BeliefExtractor):
         return Memory(*(getattr(self, f"history_{name}") for name in Memory._fields))
 
     def restore_history(self, history: Memory) -> None:  # type: ignore[override]
-        for name, rows in history._asdict().items():
-            setattr(self, f"history_{name}", rows)
+        self._set_rows(history)
         stamps = history.stamps[history.valid]
         now = int(stamps[:, 0].max()) + 1 if len(stamps) else 0
         self._set_clock(now, max(0, DEPLOYED + 1 - int(stamps[:, 1].min())) if len(stamps) else 0)
+
+    def _set_rows(self, history: Memory) -> None:
+        for name, rows in history._asdict().items():
+            setattr(self, f"history_{name}", rows)
 
     @property
     def clock(self) -> int:
@@ -102,9 +105,8 @@ class AdaptiveExtractor(BeliefExtractor):
         :param now: Number of the step that follows, whether or not anything was seen before it
         :param n_copies: In how many copies the agent acts outside of training; None if that has not changed
         """
-        n_copies = self.n_copies if n_copies is None else n_copies
-        self.restore_history(newest(followed_by(self.history, rows), self.options.history_length))
-        self._set_clock(now, n_copies)
+        self._set_rows(newest(followed_by(self.history, rows), self.options.history_length))
+        self._set_clock(now, self.n_copies if n_copies is None else n_copies)
 
     def remember_steps(
         self, rows: tuple[th.Tensor, th.Tensor, th.Tensor], visible: th.Tensor, copies: np.ndarray | None

@@ -12,6 +12,7 @@ from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
 from sb3_belief.common.rng import RngState, RngSwitch
 from sb3_belief.team import Team, TeamVecEnv, observing
 from sb3_belief.team.agent_models import env_seed
+from sb3_belief.team.observing import kept_memories
 from sb3_belief.team.recurrent import PartnerRecurrentPPO
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts
@@ -172,20 +173,16 @@ class Meeting:
         seed, memory = play.episodes_seed(repetition), memory or {}
         witness = _Witness(self.env, self.team, self.agents, self.told, memory)
         policies: list[Any] = [self.team.agents[agent].policy for agent in self.observers]
-        states = [policy.memory_state() for policy in policies]
-        for policy in policies:
-            # What is evaluated are other episodes than that which has been observed
-            policy.end_episodes()
         self.env.seed(seed)
-        try:
+        with kept_memories(policies):
+            for policy in policies:
+                # What is evaluated are other episodes than that which has been observed
+                policy.end_episodes()
             with RngSwitch(RngState(seed)):
                 outcome = evaluate(
                     _Remembering(self.model, memory, self.env.num_envs), witness, play.episodes, play.deterministic
                 )
             return Measured(outcome, *witness.accuracy())
-        finally:
-            for policy, state in zip(policies, states, strict=True):
-                policy.restore_memory_state(state)
 
     def adapt(self, checkpoints: Sequence[int], play: Play, repetition: int) -> dict[int, Measured]:
         """

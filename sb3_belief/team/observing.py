@@ -1,7 +1,7 @@
 """Agents that observe while they are evaluated: what they see goes into their histories, and no weight changes."""
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -99,16 +99,17 @@ class ObservingVecEnv(VecEnvWrapper):
 
     def _remember(self, agent: str, seen: _Seen) -> None:
         policy, active, goes_on = self._policies[agent], np.flatnonzero(seen.active), self._goes_on[agent]
-        before = self._at_turn.get(agent, seen.obs)
-        self._at_turn[agent] = map_parts(lambda *parts: _of_rows(seen.active, *parts), seen.obs, before)
         if self.most_steps is not None:
             active = active[: self.most_steps - self.steps[agent]]
-        rows = active
-        if policy.remembers_waiting and (self.most_steps is None or self.steps[agent] < self.most_steps):
-            rows = np.union1d(active, np.flatnonzero(goes_on & ~seen.active & seen.others_visible.any(axis=1)))
+        rows, obs = active, seen.obs
+        if policy.remembers_waiting:
+            before = self._at_turn.get(agent, obs)
+            obs = self._at_turn[agent] = map_parts(lambda *parts: _of_rows(seen.active, *parts), obs, before)
+            if self.most_steps is None or self.steps[agent] < self.most_steps:
+                rows = np.union1d(active, np.flatnonzero(goes_on & ~seen.active & seen.others_visible.any(axis=1)))
         if len(rows):
             policy.remember(
-                map_parts(lambda part: part[rows], self._at_turn[agent]),
+                map_parts(lambda part: part[rows], obs),
                 seen.others_actions[rows],
                 dict(zip(policy.others_action_spaces, seen.others_visible[rows].T, strict=True)),
                 own_actions=seen.actions[rows],
@@ -205,8 +206,7 @@ def observing(
     else:
         raise TypeError(f"A Team or an SB3 model can observe, not a {type(model).__name__}.")
     policies = {agent: each.policy for agent, each in models.items() if isinstance(each.policy, BeliefPolicyMixin)}
-    memories = {agent: policy.memory_state() for agent, policy in policies.items()}
-    policies = {agent: policy for agent, policy in policies.items() if memories[agent]}
+    policies = {agent: policy for agent, policy in policies.items() if policy.history is not None}
     if not policies:
         found = ", ".join(f"{agent}: {type(each).__name__}" for agent, each in models.items())
         raise ValueError(
@@ -218,9 +218,23 @@ def observing(
         observed = _ObservingTeam(env, policies, most_steps, model)
     else:
         observed = _ObservingLearner(env, policies, most_steps)
+    with kept_memories(policies.values()):
+        try:
+            yield observed
+        finally:
+            observed.is_open = False
+
+
+@contextmanager
+def kept_memories(policies: Iterable[BeliefPolicyMixin]) -> Iterator[None]:
+    """
+    Put back afterwards what policies remember, whatever they have remembered and been told meanwhile.
+
+    :param policies: The policies
+    """
+    states = [(policy, policy.memory_state()) for policy in policies]
     try:
-        yield observed
+        yield
     finally:
-        observed.is_open = False
-        for agent, policy in policies.items():
-            policy.restore_memory_state(memories[agent])
+        for policy, state in states:
+            policy.restore_memory_state(state)
