@@ -17,8 +17,8 @@ from sb3_belief.common.file_names import file_name
 from sb3_belief.team.finite import SKIPPED
 from sb3_belief.team.log_files import counters, open_logger, put_counters_back, sync_logger, table_state
 
-# Beside how many partners, the last that were met, the mean returns are logged
-_MOST_PARTNERS = 20
+#: Beside how many partners, the last that were met, the mean returns are logged
+MOST_PARTNERS = 20
 
 
 def _has_spread(key: str) -> bool:
@@ -281,7 +281,7 @@ def record_statistics(
     returns: dict[str, list[float]] = {}
     for episode in reversed(episodes):
         # The last ones met, since a pool may have any number of partners
-        if "partner" in episode and (episode["partner"] in returns or len(returns) < _MOST_PARTNERS):
+        if "partner" in episode and (episode["partner"] in returns or len(returns) < MOST_PARTNERS):
             returns.setdefault(episode["partner"], []).append(episode["r"])
     for name in sorted(returns):
         logger.record(f"partners/{name}/ep_rew_mean", safe_mean(returns[name]))

@@ -138,7 +138,8 @@ def _play(team: Team, env: TeamVecEnv, options: EnjoyOptions, frames: list[np.nd
                 if "is_success" in infos[0]:
                     successes.append(bool(infos[0]["is_success"]))
                 success = f"  {'success' if successes[-1] else 'no success'}" if "is_success" in infos[0] else ""
-                print(f"Episode {len(returns)}: return {returns[-1]:.3f}, {infos[0]['episode']['l']} steps{success}")
+                beside = f"  beside {infos[0]['partner']}" if isinstance(infos[0].get("partner"), str) else ""
+                print(f"Episode {len(returns)}: return {returns[-1]:.3f}, {infos[0]['episode']['l']} steps{success}{beside}")
     except KeyboardInterrupt:
         print("Interrupted.")
     except Exception as error:

@@ -7,7 +7,8 @@ It is a mapping with
 - ``members``: {name: partner}, where a partner is the path of a run's folder, of a team's zip or of an SB3 model's, a function
   ``module:function``, or a mapping of one of these for each agent
 - ``runs``: one or more patterns of paths (``logs/*/my-env_*``), each match of which is a member: a run by its team, a zip
-- the arguments of ``PartnerPool``: ``redraw_every``, ``redraw_unit``, ``per_copy``, ``weights``, ``seed``, ``held_out``
+- the arguments of ``PartnerPool``: ``redraw_every``, ``redraw_unit``, ``per_copy``, ``weights``, ``seed``, ``held_out``;
+  without a ``seed`` the draws are those of the run's
 - ``deterministic``: whether partners take their most likely actions
 
 Paths are relative to the working folder. In ``config.yml`` they are absolute, and ``runs`` have become ``members``, so that a
@@ -50,20 +51,23 @@ class PartnersConfig:
 
     :param learners: Names of the agents that learn
     :param pool: The partners of all others, drawn for all of them at once
+    :param has_seed: Whether the pool's seed is given; it is that of the environment otherwise
     :param deterministic: As for ``PartnersVecEnv``
     :param allow_packages: Packages of which files and functions may be
     """
 
     learners: tuple[str, ...]
     pool: PartnerPool
+    has_seed: bool = False
     deterministic: bool = False
     allow_packages: tuple[str, ...] = ()
 
-    def put_into(self, env: TeamVecEnv, evaluation: bool = False, trust_pickle: bool = False) -> TeamVecEnv:
+    def put_into(self, env: TeamVecEnv, seed: int, evaluation: bool = False, trust_pickle: bool = False) -> TeamVecEnv:
         """
         Have the partners act in an environment.
 
         :param env: The environment
+        :param seed: Of the pool's draws, if it has none of its own
         :param evaluation: Whether it is one of evaluations, in which the members that are held out are met
         :param trust_pickle: Whether to unpickle what the partners' files hold
         :return: The environment of the learners
@@ -75,8 +79,9 @@ class PartnersConfig:
         others = [agent for agent in env.possible_agents if agent not in self.learners]
         if not others:
             raise ValueError(f"partners: learners: all of {env.possible_agents} learn, so partners act for nobody.")
+        pool = self.pool if self.has_seed else self.pool.with_seed(seed)
         return PartnersVecEnv(
-            env, dict.fromkeys(others, self.pool), self.deterministic, evaluation, trust_pickle, self.allow_packages
+            env, dict.fromkeys(others, pool), self.deterministic, evaluation, trust_pickle, self.allow_packages
         )
 
 
@@ -139,7 +144,11 @@ def partners_config(settings: Mapping[str, Any], location: Location) -> Partners
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{location.text}: {error}") from None
     return PartnersConfig(
-        tuple(settings["learners"]), pool, settings.get("deterministic", False), tuple(location.extra_packages)
+        tuple(settings["learners"]),
+        pool,
+        settings.get("seed") is not None,
+        settings.get("deterministic", False),
+        tuple(location.extra_packages),
     )
 
 

@@ -173,7 +173,7 @@ def make_shown_env(shown: ShownEnvironment, saved: ShownTeam, n_envs: int, seed:
             visibility=shown.visibility,
         )
         if shown.partners is not None:
-            env = shown.partners.put_into(env, evaluation=True, trust_pickle=saved.trust)
+            env = shown.partners.put_into(env, seed, evaluation=True, trust_pickle=saved.trust)
         env = with_last_step(env, **shown.observation)
         return env if shown.adapter is None else shown.adapter(env)
 

@@ -240,7 +240,7 @@ def make_env(
         reason = cause(error)
         raise ConfigError(f"{config.origin(reason)}: {config.env_id} refuses its settings: {reason}") from error
     if config.partners is not None:
-        env = with_config_partners(config, env, evaluation, trust_pickle)
+        env = with_config_partners(config, env, seed, evaluation, trust_pickle)
     try:
         # Around the partners, who observe what they have learned with
         env = with_last_step(env, **config.observation)
@@ -249,12 +249,13 @@ def make_env(
         raise ConfigError(f"{config.source}: {config.env_id}: {error}") from error
 
 
-def with_config_partners(config: RunConfig, env: TeamVecEnv, evaluation: bool, trust_pickle: bool) -> TeamVecEnv:
+def with_config_partners(config: RunConfig, env: TeamVecEnv, seed: int, evaluation: bool, trust_pickle: bool) -> TeamVecEnv:
     """
     Put the partners of a configuration into an environment, which is closed if they do not fit.
 
     :param config: The configuration, with partners
     :param env: The environment
+    :param seed: As for ``make_env``
     :param evaluation: As for ``make_env``
     :param trust_pickle: As for ``make_env``
     :return: The environment of the learners
@@ -262,7 +263,7 @@ def with_config_partners(config: RunConfig, env: TeamVecEnv, evaluation: bool, t
     """
     assert config.partners is not None
     try:
-        return config.partners.put_into(env, evaluation, trust_pickle)
+        return config.partners.put_into(env, seed, evaluation, trust_pickle)
     except Exception as error:
         env.close()
         raise ConfigError(f"{config.origins['partners']}: partners: {cause(error)}") from error

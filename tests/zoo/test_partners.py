@@ -91,6 +91,11 @@ def test_a_run_records_its_partners_and_goes_on_with_them(runs, partnered, capsy
     met = {key for row in table(partnered / "progress.csv") for key in row if key.startswith("partners/")}
     assert met and "partners/drives/ep_rew_mean" not in met
     assert met <= {f"partners/{name}/ep_rew_mean" for name in recorded["members"]}
+    evaluated = [row for row in table(partnered / "progress.csv") if row.get("eval/mean_reward")]
+    assert len(evaluated) == 2
+    for row in evaluated:
+        assert {key for key in row if key.startswith("eval/partners/")} == {"eval/partners/drives/mean_reward"}
+        assert row["eval/partners/drives/mean_reward"] == row["eval/mean_reward"]
     assert main(["train", "--resume", str(partnered), "--until", "240", "--verbose", "0", "--allow-package", "tests"]) == 0
     assert yaml.safe_load((partnered / "config.yml").read_text())[EASY]["partners"] == recorded
     with np.load(partnered / "evaluations.npz") as data:
@@ -128,6 +133,7 @@ def test_enjoy_finds_the_partners_or_is_given_others(runs, partnered, tmp_path, 
     common = ["--episodes", "1", "--output", str(tmp_path / "episode.gif"), "--allow-package", "tests"]
     assert main(["enjoy", str(partnered), *common]) == 0
     beside = capsys.readouterr().out
+    assert "steps  beside drives\n" in beside or "success  beside drives\n" in beside
     assert main(["enjoy", str(partnered), *common, "--partners", str(runs / "ppo" / f"{EASY}_2")]) == 0
     other = capsys.readouterr().out
     # A file of nothing but the member, which is whom the run's evaluations meet
@@ -164,6 +170,27 @@ def test_members_of_a_flag_take_the_place_of_those_of_a_file(runs, tmp_path):
     by_agent = {"learners": ["car_0"], "members": {"both": {"car_1": f"{run}/team.zip:car_3", "car_2": f"{HERE}:drive"}}}
     both = load(("--partners", {"partners": by_agent})).pool.members["both"]
     assert both == {"car_1": f"{run}/team.zip:car_3", "car_2": drive}
+
+
+def test_draws_are_those_of_the_runs_seed_unless_the_pool_has_its_own(tmp_path):
+    members = {name: f"{HERE}:{name}" for name in ("brake", "drive")}
+    common = {"learners": "car_0", "members": members, "redraw_unit": "rollouts", "per_copy": False}
+
+    def drawn(run_seed, **own):
+        flag = ("--partners", {"partners": {**common, **own}})
+        config = load_config("ppo", EASY, extra_packages=("tests",), overrides=[flag])
+        env = make_env(config, 2, run_seed)
+        env.reset()
+        found = []
+        for _ in range(20):
+            env.begin_rollout()
+            first, second = env.get_attr("partner")
+            assert first == second
+            found.append(first)
+        return found
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    assert drawn(1, seed=5) == drawn(2, seed=5) == drawn(5)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,16 @@ class PartnerPool:
         names = [name for name in self.names if name in self.held_out] or self.names
         return self._only(names, RedrawSchedule(1, "episodes", True, self.schedule.seed))
 
+    def with_seed(self, seed: int) -> "PartnerPool":
+        """
+        Return the pool with other draws.
+
+        :param seed: Seed of the draws, >= 0
+        """
+        schedule = self.schedule
+        weights = list(self.weights.values())
+        return PartnerPool(self.members, schedule.every, schedule.unit, schedule.per_copy, weights, seed, self.held_out)
+
     def _only(self, names: Sequence[str], schedule: RedrawSchedule) -> "PartnerPool":
         return PartnerPool(
             {name: self.members[name] for name in names},
