@@ -18,7 +18,7 @@ from sb3_belief.study.run_reading import DAMAGED, RunData, read_run, run_folders
 from sb3_belief.study.tuning_folder import tuning_folders
 from sb3_belief.zoo.errors import ConfigError, short
 
-_COLUMNS = ("run", "algorithm", "environment", "seed", "status", "joint steps", "last score", "age")
+_COLUMNS = ("run", "algorithm", "environment", "seed", "status", "joint steps", "last score", "age", "training")
 _STYLES = {"finished": "green", "running": "cyan", "failed": "red", DAMAGED: "red"}
 _LAST_EPISODES = 100
 
@@ -70,6 +70,7 @@ def _row(run: RunData, label: str, folder: Path) -> tuple[str, ...]:
         progress,
         _last_score(run.folder),
         _age(run),
+        run.note or ("decentralised" if run.record else "-"),
     )
 
 

@@ -170,6 +170,7 @@ def _run_facts(run: ReportedRun, source: Path, quantity: str, scores: Mapping[in
         evaluations=evaluation_series(data.folder, quantity),
         diagnostics=diagnostic_series(data.folder),
         viewer=viewer.resolve() if viewer.is_file() else None,
+        trained=data.note,
     )
 
 
@@ -198,7 +199,7 @@ def _write_run_page(page: Page, path: Path) -> None:
 
 def _trained(reported: Reported) -> dict[str, str]:
     """Return what has to be said of algorithms that are not decentralised, as their runs have noted it."""
-    notes = {run.arm: str(run.data.record.get("note") or "") for run in reported.runs}
+    notes = {run.arm: run.data.note for run in reported.runs}
     return {arm: notes[arm] for arm in reported.arms if notes.get(arm)}
 
 

@@ -49,6 +49,11 @@ class RunData:
     settings: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def note(self) -> str:
+        """How its algorithm is trained, if it is not decentralised; empty otherwise."""
+        return str(self.record.get("note") or "")
+
+    @property
     def joint_steps(self) -> int | None:
         """Joint steps that it has trained, as its record says or else the end of its table."""
         steps = self.record.get("timesteps")

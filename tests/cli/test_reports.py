@@ -16,7 +16,8 @@ def logs(tmp_path):
 
 
 def test_runs_are_listed_in_lines_for_pipes(logs, capsys):
-    write_run(logs / "ippo" / "x_8", "ippo", "x", 8, [0.2], status="failed", timesteps=500, started="?")
+    note = "uses the global state in training"
+    write_run(logs / "ippo" / "x_8", "ippo", "x", 8, [0.2], status="failed", timesteps=500, started="?", note=note)
     killed = write_run(logs / "ippo" / "x_9", "ippo", "[red]", 9, [0.25], status="running", timesteps=None)
     (killed / "evaluations.npz").unlink()
     (killed / "progress.csv").write_text("a,time/total_timesteps\n1,200\n1,40")
@@ -25,14 +26,16 @@ def test_runs_are_listed_in_lines_for_pipes(logs, capsys):
     (broken / "evaluations.npz").write_text("PK")
     assert main(["runs", str(logs)]) == 0
     lines = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
-    assert lines[0] == ["run", "algorithm", "environment", "seed", "status", "joint steps", "last score", "age"]
+    assert lines[0] == ["run", "algorithm", "environment", "seed", "status", "joint steps", "last score", "age", "training"]
     rows = {line[0]: line[1:] for line in lines[1:]}
     assert len(rows) == 5
     assert rows["ippo/x_0"][:4] == ["ippo", "x", "0", "finished"] and rows["ippo/x_0"][4] == "2,000"
     assert rows["ippo/x_0"][5].startswith("success 0.")
     assert rows["ippo/x_8"][3:5] == ["failed", "500 of 1,000"] and rows["ippo/x_8"][6].endswith("s")
     assert rows["ippo/x_9"][3:5] == ["killed", "200 of 1,000"] and rows["ippo/x_9"][5] == "success 1.000 (learning)"
-    assert rows["ippo/x_A"][2:4] == ["-", "damaged"] and rows["ippo/x_A"][5] == "damaged"
+    assert rows["ippo/x_0"][7] == "decentralised" and rows["ippo/x_8"][7] == note
+    # Nothing is known of a damaged one
+    assert rows["ippo/x_A"][7] == "-" and rows["ippo/x_A"][2:4] == ["-", "damaged"] and rows["ippo/x_A"][5] == "damaged"
 
 
 def test_runs_are_a_table_on_a_terminal(logs, capsys, monkeypatch):

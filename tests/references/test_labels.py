@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from sb3_belief.study.reporting import _notes
+from sb3_belief.study.run_reading import RunData
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.model_card import CardContent, _text
 from sb3_belief.zoo.names import ALGOS, CENTRAL, SHARED
@@ -33,7 +34,7 @@ def test_its_file_of_settings_says_so(name):
 
 def test_a_report_says_so_first():
     runs = [
-        SimpleNamespace(arm=arm, data=SimpleNamespace(record=record))
+        SimpleNamespace(arm=arm, data=RunData(Path(), "finished", "ppo", "env", 0, record))
         for arm, record in (("ours", {"note": ""}), ("old", {}), ("theirs", {"note": SHARED}), ("theirs", {"note": SHARED}))
     ]
     reported: Any = SimpleNamespace(arms=["theirs", "ours", "old"], runs=runs)

@@ -163,6 +163,8 @@ def test_every_table_says_what_is_not_decentralised(tmp_path):
         with open(files(path) / "tables" / f"{table}.csv", newline="") as file:
             said = {row["arm"]: row[column] for row in csv.DictReader(file)}
         assert said == {"ippo": "", "central": note}, table
+    said_of_runs = {path.stem.rsplit("-", 1)[0]: note in Page(path).shown for path in (files(path) / "runs").glob("*.html")}
+    assert {name.split("-")[0]: said for name, said in said_of_runs.items()} == {"ippo": False, "central": True}
 
 
 def test_figures_are_files_and_hold_what_the_page_holds(report, page):

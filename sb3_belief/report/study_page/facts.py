@@ -63,6 +63,7 @@ class RunFacts:
     :param evaluations: {name of a series: its values over joint steps}: evaluations, returns while learning
     :param diagnostics: {name of a diagnostic: {agent: its values over joint steps}}
     :param viewer: File of the belief viewer, absolute; None if there is none
+    :param trained: How its algorithm is trained, if it is not decentralised
     """
 
     arm: str
@@ -85,6 +86,7 @@ class RunFacts:
     evaluations: Mapping[str, Series] = field(default_factory=dict)
     diagnostics: Mapping[str, Mapping[str, Series]] = field(default_factory=dict)
     viewer: Path | None = None
+    trained: str = ""
 
 
 @dataclass(frozen=True)

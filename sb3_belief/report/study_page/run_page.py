@@ -40,7 +40,10 @@ def run_page(run: RunFacts, unit: str, back: tuple[str, str], made: str, viewer:
         title=f"{run.arm} on {run.environment}{seed}",
         subtitle="Run",
         lead=_summary(run, unit),
-        notices=[f"This run does not count in the comparison: {run.why_not or run.status}."] if not run.counts else [],
+        notices=[
+            *([f"{run.algorithm} {run.trained}."] if run.trained else []),
+            *([f"This run does not count in the comparison: {run.why_not or run.status}."] if not run.counts else []),
+        ],
         arms=arm_colours(run.evaluations),
         sections=[section for section in sections if section.blocks],
         footer=made,
