@@ -54,8 +54,10 @@ demo: $(STAMP)  ## train a team of BeliefPPO agents on Traffic Junction and show
 test: $(STAMP)  ## run all tests but the slow ones
 	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m "not slow" $(PYTEST_ARGS)
 
-test-slow: $(STAMP)  ## play the games that prove the belief dynamic
-	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m slow $(PYTEST_ARGS)
+# Named by file, since each process would import all others, too
+test-slow: $(STAMP)  ## play the games that prove the belief dynamic, and run all else that takes long
+	$(BIN)/python -m pytest -n $(PYTEST_JOBS) --dist loadfile -m slow $(PYTEST_ARGS) \
+		$$(grep -rl --include='test_*.py' 'mark\.slow' tests)
 
 test-games: $(STAMP)  ## play all games with five seeds each (most of an hour)
 	GAME_SEEDS=5 $(BIN)/python -m pytest -n $(PYTEST_JOBS) -m slow tests/games $(PYTEST_ARGS)

@@ -26,7 +26,7 @@ from tests.field.command_lines import (
 pytestmark = pytest.mark.slow
 
 
-@draws(700)
+@draws(350)
 @given(algo=ALGO, given_pairs=pairs())
 @example("dqn", ["n_envs:2", "train_freq:[1, episode]"])
 @example("maskable_ppo", [])
@@ -72,7 +72,7 @@ _FLAGS = {
 }
 
 
-@draws(600)
+@draws(300)
 @given(
     drawn=st.lists(st.sampled_from(sorted(_FLAGS)).flatmap(lambda flag: st.tuples(st.just(flag), _FLAGS[flag])), max_size=3)
 )
@@ -102,7 +102,7 @@ _DATA = st.recursive(
 )
 
 
-@draws(400)
+@draws(200)
 @given(
     algo=st.sampled_from(["ppo", "belief_ppo", "dqn"]),
     section=st.sampled_from([ENV, "default", "nowhere", "os:system"]),

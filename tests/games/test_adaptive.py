@@ -28,7 +28,7 @@ def test_a_convention_of_one_episode_is_followed_in_each_copy_with_frozen_weight
     env = make_env(config, config.n_envs, 0)
     # Typed as Any, since SB3 takes a team for a model
     team: Any = make_team(config, TrainOptions(verbose=0), env, 0)
-    team.learn(100_000)
+    team.learn(50_000)
     blind = np.mean(evaluate_policy(team, env, n_eval_episodes=64, return_episode_rewards=True)[0])
     with observing(team, env) as watched:
         adapted = np.mean(evaluate_policy(team, watched, n_eval_episodes=64, return_episode_rewards=True)[0])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from studies.games import BELIEFS, GAMES, HISTORY, Played, play, play_all
-from tests.games.seeds import BELIEF_SEEDS
+from tests.games.seeds import SEEDS
 
 CHANCE = 0.25
 Results = Callable[[str, str], list[Played]]
@@ -36,7 +36,7 @@ def results() -> Results:
     def get(game: str, belief: str) -> list[Played]:
         if (game, belief) not in played:
             beliefs, rollouts = next(part for part in PLAYED[game] if belief in part[0])
-            played.update(play_all([game], beliefs, BELIEF_SEEDS, jobs=os.cpu_count() or 1, rollouts=rollouts))
+            played.update(play_all([game], beliefs, SEEDS, jobs=os.cpu_count() or 1, rollouts=rollouts))
         return played[game, belief]
 
     return get
@@ -60,9 +60,10 @@ def mean(played: list[Played]) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("belief", HISTORY)
 def test_swap_is_met_by_watching_alone(results, belief):
-    # A context without a distribution learns the game to the end with four of five seeds
     successes = sorted(result.success for result in results("swap", belief))
-    assert successes[0 if belief == "dynamic" else 1] >= 0.95 and successes[0] >= 0.7
+    # A context without a distribution learns the game to the end with four of five seeds, of which 0 is one
+    late = 0 if belief == "dynamic" else len(SEEDS) // 5
+    assert successes[late] >= 0.95 and successes[0] >= 0.7
 
 
 @pytest.mark.slow

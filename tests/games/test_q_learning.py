@@ -66,7 +66,7 @@ def greedy_payoff(env_id: str, tables: list[np.ndarray], **env_kwargs: Any) -> f
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_climbing(seed):
-    tables = values("climbing", seed, 0.02, n_timesteps=200_000, n_steps=25)
+    tables = values("climbing", seed, 0.02, n_timesteps=100_000, n_steps=25)
     assert tables[0][0] == pytest.approx([-6.33, -7.67, 3.67], abs=0.3)
     assert tables[1][0] == pytest.approx([-6.33, -5.67, 1.67], abs=0.3)
     assert greedy_payoff("climbing", tables) == 5
@@ -83,7 +83,7 @@ def test_the_huber_loss_fits_no_means_where_errors_are_large():
 @pytest.mark.slow
 @pytest.mark.parametrize(("k", "seed"), [*product([-25], SEEDS), *product([-50, -100], [0])])
 def test_penalty(k, seed):
-    tables = values("penalty", seed, 0.5 / (10 - k), n_timesteps=200_000, n_steps=25, k=k)
+    tables = values("penalty", seed, 0.5 / (10 - k), n_timesteps=100_000, n_steps=25, k=k)
     if k == -25:
         for table in tables:
             assert table[0] == pytest.approx([(k + 10) / 3, 2 / 3, (k + 10) / 3], abs=0.3)
@@ -105,7 +105,7 @@ def test_two_steps(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_qtran_s_matrix(seed):
-    tables = values("qtran-matrix", seed, 0.04, n_timesteps=200_000, n_steps=25)
+    tables = values("qtran-matrix", seed, 0.04, n_timesteps=100_000, n_steps=25)
     for table in tables:
         assert table[0] == pytest.approx([-16 / 3, -4, -4], abs=0.3)
     assert greedy_payoff("qtran-matrix", tables) == 0

@@ -12,8 +12,8 @@ from tests.reliability.processes import Launcher
 
 pytestmark = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="looks for processes in /proc")
 
-#: How often each is killed, together twenty times
-KILLS = dict(zip(BELIEF, (4, 3, 3, 2, 3, 2, 3), strict=True))
+#: How often each is killed, together ten times
+KILLS = dict(zip(BELIEF, (2, 2, 1, 1, 1, 1, 2), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def check(launcher, combination, folder, seed, kills):
     assert check_equal_to(killed.run, twin) > 0
 
 
-def test_twenty_kills_are_drawn_over_all_settings():
-    assert sum(KILLS.values()) == 20
+def test_ten_kills_are_drawn_over_all_settings():
+    assert sum(KILLS.values()) == 10
     words = [" ".join(each.command(Path("logs"), 0)) for each in BELIEF.values()]
     for present in ("traffic-junction", "mpe/", "lbf/", "convention-swap", "subproc", "--jobs 2", "normalize:true"):
         found = [present in line for line in words]
@@ -55,4 +55,4 @@ def test_killed_teams_of_belief_ppo_end_as_their_undisturbed_twins(tmp_path, lau
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OTHERS)
 def test_so_do_teams_of_other_algorithms(tmp_path, launcher, name):
-    check(launcher, OTHERS[name], tmp_path, 3, drawn_kills(random.Random(name), 2))
+    check(launcher, OTHERS[name], tmp_path, 3, drawn_kills(random.Random(name), 1))

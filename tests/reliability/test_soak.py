@@ -125,7 +125,7 @@ def test_a_folder_whose_path_is_too_long_for_sockets_is_refused(tmp_path):
 def test_a_short_soak_finds_nothing():
     # Not pytest's own, whose path is too long
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        report = soak(1.5, 5, Path(folder))
+        report = soak(1.0, 5, Path(folder))
     assert not report.violations
     assert report.runs > 0 and sum(report.faults.values()) > 0 and report.checks["the team loads"] > 0
 
