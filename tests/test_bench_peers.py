@@ -1,13 +1,21 @@
 """Programs in processes of their own are compared, with tiny programs in place of the libraries."""
 
 import json
+import re
+import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from benchmarks import strength
 from benchmarks.peers import __main__ as peers
+from benchmarks.peers.ours_strength import ENV, settings_of
 from benchmarks.peers.programs import Program
+from benchmarks.peers.spread_settings import OFF_POLICY, ON_POLICY, OffPolicy, OnPolicy
+from sb3_belief.zoo.config import load_config
 
 # Writes its name to a file at each iteration, which shows the order of the iterations
 CHILD = """
@@ -104,3 +112,43 @@ def test_a_library_without_its_environment_says_why(tmp_path, monkeypatch):
     assert program.error == "not installed: ERROR: no such version"
     program.start()
     assert program.samples == []
+
+
+def test_what_was_trained_is_kept_and_compared(tmp_path, monkeypatch, capsys):
+    program = (
+        "import json, sys; print('talks'); print(json.dumps({'returns': [float(sys.argv[3]) - 10, -8.0], 'seconds': 3.0}))"
+    )
+    starts = []
+
+    def run(words, **kwargs):
+        starts.append(words)
+        return subprocess.run([words[0], "-c", program, *words[3:]], **kwargs)
+
+    monkeypatch.setattr(strength, "subprocess", SimpleNamespace(run=run))
+    monkeypatch.setattr(
+        strength, "LIBRARIES", {name: (Path(sys.executable), f"some.{name}") for name in ("ours", "BenchMARL")}
+    )
+    words = ["strength", "--algorithms", "ippo", "--seeds", "2", "--steps", "50", "--folder", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    strength.main()
+    assert [(line[2], line[3:]) for line in starts] == [
+        (f"some.{library}", ["ippo", "--seed", str(seed), "--steps", "50"])
+        for seed in (0, 1)
+        for library in ("ours", "BenchMARL")
+    ]
+    first = capsys.readouterr().out
+    # The means of two episodes: -9 with seed 0, -8.5 with seed 1
+    assert "| `ippo` | -8.75 (" in first and "| 3; 3 |" in first and "ours ippo, seed 0: -9.00" in first
+    strength.main()
+    assert len(starts) == 4 and capsys.readouterr().out == first[first.index("| |") :]
+
+
+def test_both_libraries_train_with_the_same_settings():
+    for algorithm in (*ON_POLICY, *OFF_POLICY):
+        config = load_config(algorithm, ENV, overrides=[("benchmarks", settings_of(algorithm, 1000))])
+        assert (config.n_timesteps, config.n_envs) == (1000, 32 if algorithm in ON_POLICY else 8)
+        assert config.algo_kwargs["gamma"] == 0.95 and config.algo_kwargs["max_grad_norm"] == 10
+    source = (Path(strength.__file__).parent / "peers" / "benchmarl_strength.py").read_text()
+    # Its environment has no sb3_belief, so it cannot be imported here: each of the shared settings is used in it
+    for name in (*(each.name for each in fields(OnPolicy)), *(each.name for each in fields(OffPolicy))):
+        assert re.search(rf"\b(on|off|work)\.{name}\b", source), name
