@@ -169,8 +169,19 @@ EVALUATE = "--eval-freq 128 --eval-episodes 1"
 SEARCH = "-optimize --n-trials 1 --n-evaluations 1"
 
 
+# What is drawn may be ten passes in small minibatches over thousands of steps
+SHORT_TRIALS = """
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+
+def shortened(sample):
+    return lambda *args: {**sample(*args), "n_steps": 64, "batch_size": 64, "n_epochs": 1}
+
+HYPERPARAMS_SAMPLER.update({name: shortened(sample) for name, sample in HYPERPARAMS_SAMPLER.items()})
+"""
+
+
 def run_real(folder, script, command):
-    (folder / "train_zoo.py").write_text(script)
+    (folder / "train_zoo.py").write_text(script.replace("register_rl_zoo3()\n", f"register_rl_zoo3()\n{SHORT_TRIALS}"))
     words = [sys.executable, "train_zoo.py", *command.split(), *"-n 256 --seed 0 --device cpu --no-optim-plots".split()]
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     result = subprocess.run([*words, "-params", "n_envs:2", "n_steps:64"], cwd=folder, env=env, capture_output=True, text=True)
