@@ -209,7 +209,7 @@ class AdaptiveExtractor(BeliefExtractor):
 
     def with_belief(self, own: th.Tensor, output: BeliefOutput) -> BeliefFeatures | th.Tensor:
         assert output.prediction is not None
-        expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
+        expected = expected_actions(output.prediction, self.layout, self.options.loss_of(self.layout))
         return self._beside(own, th.cat([output.mean, expected], dim=-1))
 
 

@@ -51,7 +51,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
     belief: str
     history_length: int
     keep_ratio: float
-    action_loss: str
+    action_loss: str | None
     policy_latent: str
     similarity: str
     detach_belief: bool

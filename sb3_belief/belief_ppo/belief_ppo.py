@@ -73,7 +73,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         the progress remaining (from 1 to 0)
     :param kl_coef: ``beta``, weight of the KL divergence (eq. 8: 0.005), at least 0; may be a schedule
     :param action_loss: Error of the predicted actions: ``"mse"`` (eq. 7) or ``"cross_entropy"``, for others whose actions are
-        Discrete, MultiDiscrete or MultiBinary
+        Discrete, MultiDiscrete or MultiBinary; None for eq. 7, and of ``"adaptive"`` for the cross-entropy where that can be
     :param policy_latent: What policy and value are given of the belief: its ``"sample"`` (Sec. 4.2) or its ``"mean"``, while
         the prediction keeps the sample. No difference for a belief that is a single point
     :param similarity: What past steps are compared with the present by: the ``"embedding"`` (eq. 3) or the ``"observation"``
@@ -146,7 +146,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         keep_ratio: float = 0.05,
         action_coef: float | Schedule = 0.5,
         kl_coef: float | Schedule = 0.005,
-        action_loss: str = "mse",
+        action_loss: str | None = None,
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,

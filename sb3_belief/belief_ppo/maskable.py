@@ -155,7 +155,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         keep_ratio: float = 0.05,
         action_coef: float | Schedule = 0.5,
         kl_coef: float | Schedule = 0.005,
-        action_loss: str = "mse",
+        action_loss: str | None = None,
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,

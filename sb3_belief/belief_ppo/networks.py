@@ -73,7 +73,7 @@ class BeliefNetworksMixin(_Policy):
         belief: str = "dynamic",
         history_length: int = 800,
         keep_ratio: float = 0.05,
-        action_loss: str = "mse",
+        action_loss: str | None = None,
         policy_latent: str = "sample",
         similarity: str = "embedding",
         detach_belief: bool = False,
@@ -120,6 +120,7 @@ class BeliefNetworksMixin(_Policy):
         self.belief_from_features = belief_from_features
         self.layout = action_layout(self.others_action_spaces)
         self.options.check_others(self.others_action_spaces, self.layout)
+        self.action_loss = self.options.loss_of(self.layout)
         self.has_belief = self.options.variant is not None and self.layout.n_others > 0
         if features_extractor_class is None:
             features_extractor_class = self.default_extractor or fitting_extractor(observation_space)

@@ -27,7 +27,7 @@ class BeliefOptions:
     belief: str = "dynamic"
     history_length: int = 800
     keep_ratio: float = 0.05
-    action_loss: str = "mse"
+    action_loss: str | None = None
     policy_latent: str = "sample"
     similarity: str = "embedding"
     detach_belief: bool = False
@@ -41,7 +41,8 @@ class BeliefOptions:
 
     def __post_init__(self) -> None:
         _check_choice("belief", self.belief, BELIEFS)
-        _check_choice("action_loss", self.action_loss, ACTION_LOSSES)
+        if self.action_loss is not None:
+            _check_choice("action_loss", self.action_loss, ACTION_LOSSES)
         _check_choice("policy_latent", self.policy_latent, POLICY_LATENTS)
         _check_choice("similarity", self.similarity, SIMILARITIES)
         if not isinstance(self.history_length, Integral) or self.history_length < 1:
@@ -88,6 +89,17 @@ class BeliefOptions:
     def variant(self) -> Variant | None:
         """The parts that the belief has; None without a belief."""
         return _VARIANTS.get(self.belief)
+
+    def loss_of(self, layout: ActionLayout) -> str:
+        """
+        Return the action loss: the one that is given, or else the belief's own.
+
+        :param layout: Layout of the others' actions
+        :return: A key of ``ACTION_LOSSES``
+        """
+        if self.action_loss is not None:
+            return self.action_loss
+        return "cross_entropy" if self.belief == "adaptive" and "number" not in layout.kinds else "mse"
 
     def check_others(self, names: Collection[str], layout: ActionLayout) -> None:
         """

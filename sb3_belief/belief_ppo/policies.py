@@ -248,7 +248,7 @@ class BeliefPolicyMixin(RememberingMixin):
         :param minibatch: Their actions and visibility
         :return: Eq. 7, or the cross-entropy in its place, a scalar
         """
-        loss = ACTION_LOSSES[self.options.action_loss]
+        loss = ACTION_LOSSES[self.action_loss]
         return loss(prediction, minibatch.others_actions, minibatch.others_visible, self.layout)
 
     def attach_terminal_values(self, infos: list[dict[str, Any]], dones: np.ndarray) -> None:
@@ -303,7 +303,7 @@ class BeliefPolicyMixin(RememberingMixin):
         with th.no_grad():
             output = self._extractor.infer(self.flat_observations(tensor))
             assert output.prediction is not None
-            expected = expected_actions(output.prediction, self.layout, self.options.action_loss)
+            expected = expected_actions(output.prediction, self.layout, self.action_loss)
 
         def shown(tensor: th.Tensor) -> np.ndarray:
             array = tensor.cpu().numpy()

@@ -146,7 +146,7 @@ class PolicyGraph(nn.Module):
     def _believed(self, output: BeliefOutput) -> dict[str, th.Tensor]:
         outputs, policy = {}, self.policy
         if output.prediction is not None:
-            expected = expected_actions(output.prediction, policy.layout, policy.options.action_loss)
+            expected = expected_actions(output.prediction, policy.layout, policy.action_loss)
             for owner, name in enumerate(policy.others_action_spaces):
                 outputs[f"others.{name}"] = expected[:, policy.layout.columns_of(owner)]
         outputs["belief_mean"] = output.mean

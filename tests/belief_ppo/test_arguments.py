@@ -178,6 +178,23 @@ def test_cross_entropy_is_refused_for_numbers_and_for_them_alone():
         make_model(belief=belief, **kwargs)
 
 
+def test_without_an_action_loss_each_belief_has_its_own(tmp_path):
+    """That of the paper; of the adaptive one that with which it learns sooner (docs/results.md), where it can be computed."""
+    numbers = {"b": spaces.Discrete(2), "c": spaces.Box(-1, 1, (2,), np.float32)}
+    finite = {"b": spaces.Discrete(2), "c": spaces.MultiBinary(2)}
+    for belief, others, expected in (
+        ("dynamic", finite, "mse"),
+        ("static", finite, "mse"),
+        ("adaptive", finite, "cross_entropy"),
+        ("adaptive", numbers, "mse"),
+    ):
+        kwargs: dict[str, Any] = dict(belief=belief, seed=0, env_kwargs=dict(others=others))
+        unnamed, named = (make_model(**kwargs, **given).learn(2 * ROLLOUT) for given in ({}, dict(action_loss=expected)))
+        assert same_parameters(unnamed, named) and unnamed.policy.action_loss == expected
+        unnamed.save(tmp_path / "model")
+        assert BeliefPPO.load(tmp_path / "model").policy.action_loss == expected
+
+
 def test_without_a_belief_the_others_may_share_no_features():
     policy = make_model(belief="none", policy_kwargs=dict(share_features_extractor=False)).policy
     assert policy.pi_features_extractor is not policy.vf_features_extractor
