@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, NamedTuple
@@ -24,12 +25,16 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief import BeliefPPO, Team, make_team_env
+from sb3_belief.team import observing
+from sb3_belief.team.observing import ObservingVecEnv
 from sb3_belief.zoo.config import load_config
 from sb3_belief.zoo.train import TrainOptions, make_env, make_team
 
 FOLLOWER = "follower"
 HISTORY = ("dynamic", "context")
 BELIEFS = (*HISTORY, "variational", "static", "wide", "none")
+#: Beyond the paper, and played on request: --beliefs adaptive
+ADAPTIVE = "adaptive"
 # No training uses conventions with seeds from here on
 FRESH_SEEDS = 1_000_000
 
@@ -166,6 +171,7 @@ def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterabl
     model: BeliefPPO = team.agents[FOLLOWER]  # type: ignore[assignment]
     weights = {name: value.clone() for name, value in model.policy.named_parameters()}
     visible = "leader_visible:false" not in env_kwargs
+    remembers = model.belief in (*HISTORY, ADAPTIVE)
     hits = []
     met: set[tuple[int, ...]] = set()
     for seed in itertools.count(FRESH_SEEDS):
@@ -176,17 +182,18 @@ def fresh_conventions(team: Team, n_envs: int, n_steps: int, env_kwargs: Iterabl
         if convention in met:
             continue
         met.add(convention)
-        obs = env.reset()
-        for step in range(2 * n_steps):
-            watches = step < n_steps
-            actions, _ = team.predict(obs, deterministic=not watches)
-            seen = obs
-            obs, _, _, infos = env.step(actions)
-            leader = np.array([info["scripted_actions"] for info in infos])
-            if watches:
-                model.policy.remember(seen[FOLLOWER], leader if visible else 0 * leader)
-            else:
-                hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
+        # It remembers nothing of the steps in which it acts, of which an adaptive belief could make use
+        with observing(team, env) if remembers else nullcontext(env) as watched:
+            obs: Any = watched.reset()
+            for step in range(2 * n_steps):
+                watches = step < n_steps
+                if isinstance(watched, ObservingVecEnv):
+                    watched.is_open = watches
+                actions, _ = team.predict(obs, deterministic=not watches)
+                obs, _, _, infos = watched.step(actions)  # type: ignore[arg-type]
+                leader = np.array([info["scripted_actions"] for info in infos])
+                if not watches:
+                    hits.append(float((actions[FOLLOWER] == leader.argmax(axis=1)).mean()))
         env.close()
         if len(met) == math.factorial(len(convention)):
             break
@@ -208,7 +215,7 @@ def play_all(
     :return: ``{(game, variant): [result of each seed]}``
     """
     beliefs, seeds = list(beliefs), list(seeds)
-    pairs = [(name, belief) for name in names for belief in GAMES[name].beliefs if belief in beliefs]
+    pairs = [(name, belief) for name in names for belief in (*GAMES[name].beliefs, ADAPTIVE) if belief in beliefs]
     runs = [(name, belief, seed, rollouts) for name, belief in pairs for seed in seeds]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         results = list(pool.map(play, *zip(*runs, strict=True)))
@@ -218,7 +225,7 @@ def play_all(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--games", nargs="+", default=list(GAMES), choices=list(GAMES))
-    parser.add_argument("--beliefs", nargs="+", default=list(BELIEFS), choices=BELIEFS)
+    parser.add_argument("--beliefs", nargs="+", default=list(BELIEFS), choices=(*BELIEFS, ADAPTIVE))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()
