@@ -22,7 +22,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="POOL",
         help="YAML file of partners as for train (members, runs, ...), a run, a folder of runs, or for the environment's own"
-        " partners an argument and its values: partner_seed:100..107, kind:left,right",
+        " partners an argument and its values: partner_seed:100..107, partner_seed:3,5,9",
     )
     parser.add_argument("--agent", type=filled_text, help="agent that meets the others; if left out, each in turn")
     for role, help in (("blind", "knows nothing of the partner"), ("oracle", "is told who the partner is")):

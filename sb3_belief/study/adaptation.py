@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,12 +34,14 @@ from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short, unknown_
 from sb3_belief.zoo.partners import PartnersConfig, partners_config
 from sb3_belief.zoo.preflight import check_device, check_folder
 from sb3_belief.zoo.replay import ShownEnvironment, ShownTeam, environment_of, load_into, make_shown_env
-from sb3_belief.zoo.run_folder import RECORD, find_team
+from sb3_belief.zoo.run_folder import RECORD, find_team, run_of
 
 #: Steps observed since the swap at which is measured
 CHECKPOINTS = (0, 25, 50, 100, 200, 400, 800)
 # By these a partner of an environment's own stays, and is the same in all copies (where the environment has such arguments)
-_STAYS: Mapping[str, Any] = {"redraw_every": None, "redraw_unit": "rollouts", "per_copy": False, "K": None}
+_STAYS: Mapping[str, Any] = {"redraw_every": None, "redraw_unit": "rollouts", "per_copy": False}
+# And by this the convention of the games, where it is the environment's partners who are met; elsewhere K may be anything
+_CONVENTION_STAYS: Mapping[str, Any] = {"K": None}
 _COMMAND = "adapt"
 
 
@@ -79,6 +81,9 @@ class _Contender:
     @staticmethod
     def of(role: str, saved: ShownTeam, flag: str) -> "_Contender":
         path = find_team(saved.run, flag)
+        # --env is of the team that is measured; others are told or not by the settings of their own run
+        if role != TEAM and run_of(path) is not None:
+            saved = replace(saved, env=None)
         # Those whom it has met in its training are not met here
         shown = replace(environment_of(path, saved, flag), partners=None)
         try:
@@ -108,7 +113,7 @@ def adapt(options: AdaptOptions) -> tuple[Path, str]:
             numbers[role] = number
         elif given is not None:
             # The arguments of the environment are those of its own run: the oracle is told something
-            contenders.append(_Contender.of(role, replace(options, run=given, env=options.env), f"--{role}"))
+            contenders.append(_Contender.of(role, replace(options, run=given), f"--{role}"))
             own, other = contenders[0].shown.env_id, contenders[-1].shown.env_id
             if own != other:
                 raise ConfigError(f"--{role}: {given!r} is of {other}, the team of {own}: their returns cannot be compared.")
@@ -184,6 +189,7 @@ def _measured(contender: _Contender, entry: PoolEntry, options: AdaptOptions) ->
         for agent, meeting in meetings:
             for repetition in range(options.play.repetitions):
                 found = meeting.adapt(checkpoints, options.play, repetition)
+                _check_one_partner(entry, meeting.told)
                 rows += [
                     {
                         "role": contender.role,
@@ -200,12 +206,16 @@ def _measured(contender: _Contender, entry: PoolEntry, options: AdaptOptions) ->
                     for steps, each in found.items()
                 ]
         told = {name for _, meeting in meetings for name in meeting.told}
+    _check_one_partner(entry, told)
+    return [{name: {**row, "type": next(iter(told), "")}[name] for name in (*TEXTS, *NUMBERS)} for row in rows]
+
+
+def _check_one_partner(entry: PoolEntry, told: Collection[str]) -> None:
     if len(told) > 1:
         raise ConfigError(
             f"{_COMMAND}: {entry.name} is not one partner but several, {sorted(told)}, one after the other: give"
             " --env-kwargs by which the environment's partner stays."
         )
-    return [{name: {**row, "type": next(iter(told), "")}[name] for name in (*TEXTS, *NUMBERS)} for row in rows]
 
 
 def _name_of(path: Path) -> str:
@@ -257,7 +267,8 @@ def _shown(shown: ShownEnvironment, entry: PoolEntry, saved: ShownTeam) -> Shown
         skip=len(env.leading),
         of_env=True,
     )
-    stays = {name: value for name, value in _STAYS.items() if name in accepted_arguments(make)[0]}
+    wanted = {**_STAYS, **(_CONVENTION_STAYS if entry.partners is None else {})}
+    stays = {name: value for name, value in wanted.items() if name in accepted_arguments(make)[0]}
     asked = {pair.partition(":")[0] for pair in saved.env_kwargs}
     kept = {name: value for name, value in stays.items() if name not in asked}
     return replace(shown, env_kwargs={**shown.env_kwargs, **kept, **given})

@@ -289,7 +289,7 @@ class _Player:
             self._obs, self._state, self._starts, self._deterministic, action_masks=masks
         )
         self._obs, _, self._starts, infos = self._env.step(actions)
-        self._told.update(info["partner"] for info in infos if "partner" in info)
+        self._told.update(str(info["partner"]) for info in infos if "partner" in info)
         self._played += 1
 
 
@@ -332,7 +332,7 @@ class _Witness(VecEnvWrapper):
                     (map_parts(lambda part, rows=rows: part[rows], self._obs[agent]), transitions[agent].others_actions[rows])
                 )
         self._obs = step[0]
-        self._told.update(info["partner"] for info in step[3] if "partner" in info)
+        self._told.update(str(info["partner"]) for info in step[3] if "partner" in info)
         return step
 
     def accuracy(self) -> tuple[float | None, float | None]:

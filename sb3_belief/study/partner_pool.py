@@ -15,7 +15,7 @@ from sb3_belief.zoo.partners import check_partners, partners_of_flag
 from sb3_belief.zoo.run_folder import RECORD
 from sb3_belief.zoo.yaml_data import parse
 
-# partner_seed:100..107, or kind:left,right
+# partner_seed:100..107, or partner_seed:3,5,9
 _VALUES = re.compile(r"([A-Za-z_]\w*):(.+)")
 _RANGE = re.compile(r"(\d+)\.\.(\d+)")
 _MOST = 1000

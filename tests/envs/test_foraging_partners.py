@@ -122,6 +122,17 @@ def test_a_return_is_the_share_of_food(env_id):
     assert np.mean(shares) > 0.3
 
 
+def test_on_a_small_field_a_picker_takes_what_there_is():
+    env = make_parallel_env("picker", game="Foraging-5x5-2p-3f-coop-v3")
+    counts = set()
+    for episode in range(30):
+        env.reset(seed=episode)
+        counts.add(len(env.situation().foods))
+        while env.agents:
+            env.step({ME: 0})
+    assert len(counts) > 1
+
+
 def test_a_type_stays_for_ten_episodes():
     def types(seed, **kwargs):
         env, met = make_parallel_env("picker", **kwargs), []

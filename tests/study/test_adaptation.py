@@ -176,6 +176,21 @@ def test_a_gap_lies_in_one_environment(teams, tmp_path):
         adapt(options_of(teams, tmp_path, run=one, env=None, blind=other))
 
 
+def test_bounds_are_measured_in_the_environments_of_their_own_runs(tmp_path):
+    """--env names that of a zip that is in no run; who is told observes more than it."""
+    paths = {}
+    for name, told in (("plain", False), ("told", True)):
+        env = make_team_env("convention-episode", n_envs=2, seed=0, env_kwargs={"reveal_partner": told})
+        paths[name] = tmp_path / f"{name}.zip"
+        Team(BeliefPPO, "BeliefPolicy", env, seed=0, device="cpu", **TINY).save(paths[name])
+    run = run_folder(paths["told"], tmp_path / "run", "convention-episode", reveal_partner=True)
+    options = AdaptOptions(str(paths["plain"]), env="convention-episode", pool="partner_seed:3", output=str(tmp_path / "out"))
+    adapt(replace(options, play=PLAY, checkpoints=(0, 5), oracle=run))
+    assert {row["role"] for row in rows_of(tmp_path)} == {"team", "oracle"}
+    with pytest.raises(ConfigError, match="cannot be loaded"):
+        adapt(replace(options, play=PLAY, checkpoints=(0, 5), oracle=str(paths["told"])))
+
+
 @pytest.mark.parametrize("env_id", ["convention-swap", "convention-episode"])
 def test_a_partner_of_the_environment_stays_or_is_refused(env_id, tmp_path, monkeypatch):
     env = make_team_env(env_id, n_envs=2, seed=0)

@@ -94,7 +94,12 @@ def _first_step(food: Cell, field: np.ndarray, me: Cell, blocked: set[Cell]) -> 
 
 
 def _in_order(order: Sequence[int]) -> Choice:
-    return lambda now: next((now.foods[number] for number in order if now.field[now.foods[number]]), None)
+    def choose(now: Situation) -> Cell | None:
+        # On a small field lbforaging may find no room for the last of them
+        there = [now.foods[number] for number in order if number < len(now.foods)]
+        return next((food for food in there if now.field[food]), None)
+
+    return choose
 
 
 def _closest(to_centre: bool, able: Callable[[Situation, int], bool]) -> Choice:

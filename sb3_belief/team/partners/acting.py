@@ -105,7 +105,7 @@ class Seat:
 
     def __init__(self, agent: str, index: int, space: spaces.Space, members: Sequence[CopiesPartner], n_envs: int):
         self.agent, self._index, self._members = agent, index, list(members)
-        self._shape = (n_envs, *(space.shape or ()))
+        self._space, self._shape = space, (n_envs, *(space.shape or ()))
         self._all = np.arange(n_envs)
         #: The agent's observations, ``[n_envs, ...]``
         self.obs: Any = None
@@ -138,7 +138,7 @@ class Seat:
         :param present: Index of the member in each copy, int ``[n_envs]``
         :param masks: The agent's possible actions, bool ``[n_envs, k]``, or None
         :return: The actions, ``[n_envs, ...]``
-        :raises ValueError: If they do not have the shape that the agent's actions have
+        :raises ValueError: If they are none of the agent's actions
         """
         if not np.array_equal(present, self._present):
             self._replace(present)
@@ -178,6 +178,9 @@ class Seat:
                 f"The partner {self.agent!r} must return actions of the shape {wanted}, one for each of {len(copies)} copies,"
                 f" got {actions.shape}."
             )
+        if not _is_of(actions, self._space):
+            got = ", ".join(dict.fromkeys(str(each) for each in actions[:4].tolist()))
+            raise ValueError(f"The partner {self.agent!r} must return actions of its action space, {self._space}, got {got}.")
         return actions
 
     def observe(self, obs: Any, ended: np.ndarray) -> None:
@@ -204,6 +207,21 @@ class Seat:
         self._group(state["present"])
         for member, saved in zip(self._members, state["members"], strict=True):
             member.set_state(saved)
+
+
+def _is_of(actions: np.ndarray, space: spaces.Space) -> bool:
+    """Return whether actions are numbers of a space's kind, and within it where it is finite."""
+    if isinstance(space, spaces.Box):
+        return actions.dtype.kind in "iufb"
+    if actions.dtype.kind not in "iub":
+        return False
+    if isinstance(space, spaces.Discrete):
+        low, high = space.start, space.start + space.n
+    elif isinstance(space, spaces.MultiDiscrete):
+        low, high = space.start, space.start + space.nvec
+    else:
+        low, high = 0, 2
+    return bool(((actions >= low) & (actions < high)).all())
 
 
 def _rows_of(obs: Any, rows: np.ndarray) -> Any:

@@ -51,6 +51,8 @@ class PartnerPool:
         self.members = dict(members)
         self.names = list(self.members)
         self.schedule = RedrawSchedule(redraw_every, redraw_unit, per_copy, seed)
+        if not isinstance(held_out, Iterable):
+            raise TypeError(f"held_out of a pool is a list of names of members, not {held_out!r}.")
         self.held_out = [held_out] if isinstance(held_out, str) else list(held_out)
         unknown = [name for name in self.held_out if name not in self.members]
         if unknown:

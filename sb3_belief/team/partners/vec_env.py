@@ -172,7 +172,7 @@ class PartnersVecEnv(TeamVecEnvWrapper):
                 if key in info:
                     info[key] = {agent: info[key][agent] for agent in self.possible_agents if agent in info[key]}
             if names is not None:
-                info["partner"] = "+".join([names[i], info["partner"]] if "partner" in info else [names[i]])
+                info["partner"] = "+".join([names[i], str(info["partner"])] if "partner" in info else [names[i]])
         return own["agent_rewards"].mean(axis=1, dtype=np.float32)
 
     # Who is there

@@ -107,6 +107,9 @@ def test_a_function_of_batches_is_called_once_a_step():
         play(partnered({"agent_1": one_for_all}), 1, begin=True)
     with pytest.raises(ValueError, match=r"must return actions of the shape \(2,\)"):
         play(partnered({"agent_1": lambda obs: [1]}), 1, begin=True)
+    for wrong in (None, 7, -1, 0.5):
+        with pytest.raises(ValueError, match=rf"'agent_1' must return actions of its action space, Discrete\(3\), got {wrong}\."):
+            play(partnered({"agent_1": lambda obs, wrong=wrong: wrong}), 1, begin=True)
 
 
 def test_learners_meet_what_they_meet_without_partners():

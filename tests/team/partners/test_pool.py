@@ -285,6 +285,7 @@ def test_a_training_goes_on_exactly(tmp_path):
         (ZERO_ONE, {"weights": [0, 0]}, ValueError, "not held out have the weight 0"),
         (ZERO_ONE, {"weights": [1, 0], "held_out": "one"}, ValueError, "held out have the weight 0"),
         (ZERO_ONE, {"weights": "ab"}, TypeError, "a list of one number for each member"),
+        (ZERO_ONE, {"held_out": 3}, TypeError, "held_out of a pool is a list of names of members, not 3"),
     ],
 )
 def test_wrong_pools(members, kwargs, error, message):
