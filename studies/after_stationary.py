@@ -27,10 +27,10 @@ from sb3_belief.zoo.train import TrainOptions, make_env, make_team
 _ADAPTIVE = ("belief:adaptive", "action_loss:cross_entropy")
 ARMS: dict[str, tuple[str, ...]] = {
     "dynamic": (),
-    "adaptive": _ADAPTIVE,
-    "dropout": (*_ADAPTIVE, "history_dropout:0.1"),
+    "adaptive": (*_ADAPTIVE, "belief_replay:0"),
+    "dropout": (*_ADAPTIVE, "belief_replay:0", "history_dropout:0.1"),
     "replay": (*_ADAPTIVE, "belief_replay:16"),
-    "both": (*_ADAPTIVE, "history_dropout:0.1", "belief_replay:16"),
+    "both": (*_ADAPTIVE, "belief_replay:16", "history_dropout:0.1"),
 }
 STATIONARY_ROLLOUTS = 200
 OBSERVED_STEPS = 800

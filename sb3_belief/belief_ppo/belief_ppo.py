@@ -85,7 +85,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         others do, of ``"own_action"``, ``"reward"``, ``"age"``, ``"episode"`` (whether it is of the same one) and ``"copy"``
     :param history_dropout: Of ``"adaptive"``: share of the steps in training at which it sees nothing of its memory, in [0, 1)
     :param belief_replay: Of ``"adaptive"``: on how many past rollouts its predictions are trained as well, at least 0, so that
-        its weights do not learn the present teammates by heart
+        its weights do not learn the present teammates by heart. As many tables of memory and rollout are kept
     :param prediction_steps: Of ``"adaptive"``: of how many steps it predicts the others' actions, at least 1: of the present
         one, which is what policy and value are given, and of those after it, up to the end of its return
     :param critic_sees_others: Of ``"adaptive"``: whether advantages are measured against a baseline that also sees what the
@@ -154,7 +154,7 @@ class BeliefPPO(BeliefAlgorithmMixin, PPO):
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
-        belief_replay: int = 0,
+        belief_replay: int = 16,
         prediction_steps: int = 1,
         critic_sees_others: bool = False,
         value_norm: bool = False,

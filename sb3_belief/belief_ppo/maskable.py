@@ -163,7 +163,7 @@ class MaskableBeliefPPO(BeliefAlgorithmMixin, MaskablePPO):  # type: ignore[misc
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
-        belief_replay: int = 0,
+        belief_replay: int = 16,
         prediction_steps: int = 1,
         critic_sees_others: bool = False,
         value_norm: bool = False,

@@ -81,7 +81,7 @@ class BeliefNetworksMixin(_Policy):
         n_pool: int = 32,
         row_features: Sequence[str] = ROW_FEATURES,
         history_dropout: float = 0.0,
-        belief_replay: int = 0,
+        belief_replay: int = 16,
         prediction_steps: int = 1,
         critic_sees_others: bool = False,
         embedding_dim: int = EMBEDDING_DIM,
