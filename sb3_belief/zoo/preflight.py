@@ -5,7 +5,8 @@ import itertools
 import math
 import os
 import tempfile
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from inspect import signature
 from pathlib import Path
@@ -17,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_belief.common.action_masks import sample_action
+from sb3_belief.envs.registry import spec
 from sb3_belief.team import TeamVecEnv
 from sb3_belief.zoo.config import AgentConfig, RunConfig
 from sb3_belief.zoo.errors import ConfigError, cause, reason_of, short, shorten
@@ -138,6 +140,32 @@ def check_memory(config: RunConfig, env: TeamVecEnv) -> None:
         raise ConfigError(
             f"{config.origin(name)}: the models need about {needed / _GB:,.0f} GB of memory, and this machine has"
             f" {total_memory() / _GB:,.0f} GB. Lower {name!r}, of which {agent} alone needs {largest[name] / _GB:,.1f} GB."
+        )
+
+
+def warn_of_rollouts(config: RunConfig, agents: Sequence[str]) -> None:
+    """
+    Warn if an environment that draws others of its own by rollouts counts other rollouts than the agents have.
+
+    :param config: Configuration of the team
+    :param agents: Names of the agents
+    """
+    try:
+        parameters = signature(spec(config.env_id).load()).parameters
+    # What is written in C may have none
+    except (TypeError, ValueError):
+        return
+    given = {**{name: each.default for name, each in parameters.items()}, **config.env_kwargs}
+    steps = given.get("rollout_steps")
+    if given.get("redraw_unit") != "rollouts" or not isinstance(steps, int):
+        return
+    lengths: set[int] = {config.agent(agent).algo_kwargs.get("n_steps", steps) for agent in agents}
+    if lengths != {steps}:
+        warnings.warn(
+            f"{config.env_id} counts rollouts of rollout_steps={steps} steps, but those of the agents have n_steps of"
+            f" {', '.join(map(str, sorted(lengths)))}: whom it draws changes within them. To have both alike set"
+            f" rollout_steps in env_kwargs (--env-kwargs rollout_steps:{min(lengths)}).",
+            stacklevel=2,
         )
 
 

@@ -30,6 +30,7 @@ from sb3_belief.zoo.preflight import (
     check_memory,
     check_optimizers,
     check_step,
+    warn_of_rollouts,
 )
 from sb3_belief.zoo.run_folder import (
     RunRecord,
@@ -152,6 +153,7 @@ def make_envs(config: RunConfig, options: TrainOptions, stack: ExitStack) -> tup
     stack.callback(env.close)
     config.check_agents(env.possible_agents)
     check_memory(config, env)
+    warn_of_rollouts(config, env.possible_agents)
     _check_first_reset(config, env)
     if config.wrapper is not None:
         with closing(make_env(config, 1, seed, trust_pickle=options.trust)) as tried:

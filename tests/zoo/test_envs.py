@@ -1,6 +1,7 @@
 """Environments by name on the command line: suites, a user's own, the list of them and the check."""
 
 import sys
+import warnings
 
 import pytest
 import yaml
@@ -183,3 +184,32 @@ def test_a_suite_that_is_asked_for_is_listed_in_full(monkeypatch):
     monkeypatch.setattr(envs, "_SHORT", 3)
     assert "... and 9 more: sb3-belief envs list mpe" in envs.list_envs()
     assert "..." not in envs.list_envs("mpe")
+
+
+@pytest.mark.parametrize(
+    ("n_steps", "env_kwargs", "warns"),
+    [(16, [], False), (8, [], True), (8, ["rollout_steps:8"], False), (8, ["redraw_unit:episodes", "per_copy:true"], False)],
+)
+def test_rollouts_that_the_environment_counts_otherwise_are_named(tmp_path, n_steps, env_kwargs, warns):
+    words = [
+        "--algo",
+        "ippo",
+        "--env",
+        "convention-redraw",
+        "-f",
+        str(tmp_path),
+        "--verbose",
+        "0",
+        "--eval-freq",
+        "-1",
+        "-n",
+        "32",
+    ]
+    words += ["--env-kwargs", *env_kwargs] if env_kwargs else []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert train_main([*words, "-params", "n_envs:2", f"n_steps:{n_steps}", "batch_size:8", "n_epochs:1"]) == 0
+    said = [str(each.message) for each in caught if "counts rollouts" in str(each.message)]
+    assert len(said) == warns
+    if warns:
+        assert "rollout_steps=16 steps" in said[0] and "--env-kwargs rollout_steps:8" in said[0]
