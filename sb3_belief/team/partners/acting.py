@@ -179,7 +179,7 @@ class Seat:
                 f" got {actions.shape}."
             )
         if not _is_of(actions, self._space):
-            got = ", ".join(dict.fromkeys(str(each) for each in actions[:4].tolist()))
+            got = ", ".join(list(dict.fromkeys(map(str, actions.tolist())))[:20])
             raise ValueError(f"The partner {self.agent!r} must return actions of its action space, {self._space}, got {got}.")
         return actions
 
