@@ -108,7 +108,7 @@ def test_a_function_of_batches_is_called_once_a_step():
     with pytest.raises(ValueError, match=r"must return actions of the shape \(2,\)"):
         play(partnered({"agent_1": lambda obs: [1]}), 1, begin=True)
     for wrong in (None, 7, -1, 0.5):
-        with pytest.raises(ValueError, match=rf"'agent_1' must return actions of its action space, Discrete\(3\), got {wrong}\."):
+        with pytest.raises(ValueError, match=rf"must return actions of its action space, Discrete\(3\), got {wrong}\."):
             play(partnered({"agent_1": lambda obs, wrong=wrong: wrong}), 1, begin=True)
 
 
