@@ -7,10 +7,7 @@ The settings are those of ``spread_settings``, and BenchMARL's own in all else. 
 returns of the greedy episodes, each the mean of the three agents', and CPU seconds.
 """
 
-import argparse
-import json
 import tempfile
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -29,11 +26,12 @@ from benchmarks.peers.spread_settings import (
     HIDDEN,
     LENGTH,
     MAX_GRAD_NORM,
-    OFF_POLICY,
     ON_POLICY,
     OffPolicy,
     OnPolicy,
+    arguments,
     is_continuous,
+    print_answer,
     vf_coef,
 )
 
@@ -97,12 +95,7 @@ def returns_of(experiment: Experiment, episodes: int, seed: int) -> list[float]:
 
 def main() -> None:
     """Train, play, and print the returns."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algorithm", choices=(*ON_POLICY, *OFF_POLICY))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=100_000)
-    parser.add_argument("--episodes", type=int, default=320)
-    args = parser.parse_args()
+    args = arguments(__doc__)
     torch.set_num_threads(1)
     model = MlpConfig.get_from_yaml()
     model.num_cells, model.activation_class = list(HIDDEN), torch.nn.Tanh
@@ -118,7 +111,7 @@ def main() -> None:
         )
         experiment.run()
         returns = returns_of(experiment, args.episodes, 1_000_000 + args.seed)
-    print(json.dumps({"returns": returns, "seconds": time.process_time()}))
+    print_answer(returns)
 
 
 if __name__ == "__main__":

@@ -4,9 +4,6 @@ What a team of ours has learned of simple_spread after so many steps, run by ``b
     python -m benchmarks.peers.ours_strength ippo --seed 0 --steps 100000
 """
 
-import argparse
-import json
-import time
 from typing import Any
 
 import torch as th
@@ -16,11 +13,12 @@ from benchmarks.peers.spread_settings import (
     GAMMA,
     LENGTH,
     MAX_GRAD_NORM,
-    OFF_POLICY,
     ON_POLICY,
     OffPolicy,
     OnPolicy,
+    arguments,
     is_continuous,
+    print_answer,
     vf_coef,
 )
 from sb3_belief.zoo.config import load_config
@@ -51,12 +49,7 @@ def settings_of(algorithm: str, steps: int) -> dict[str, Any]:
 
 def main() -> None:
     """Train, play, and print the returns."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algorithm", choices=(*ON_POLICY, *OFF_POLICY))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=100_000)
-    parser.add_argument("--episodes", type=int, default=320)
-    args = parser.parse_args()
+    args = arguments(__doc__)
     th.set_num_threads(1)
     kwargs = ["continuous_actions:true"] if is_continuous(args.algorithm) else []
     given = ("benchmarks.strength", settings_of(args.algorithm, args.steps))
@@ -66,7 +59,7 @@ def main() -> None:
     team.learn(args.steps)
     env: Any = make_env(config, 8, 1_000_000 + args.seed, evaluation=True)
     returns: Any = evaluate_policy(team, env, args.episodes, return_episode_rewards=True)[0]
-    print(json.dumps({"returns": [float(each) for each in returns], "seconds": time.process_time()}))
+    print_answer([float(each) for each in returns])
 
 
 if __name__ == "__main__":

@@ -4,6 +4,9 @@ The settings with which ``benchmarks.strength`` trains on simple_spread, the sam
 This needs nothing but the standard library, since the environment of the other library reads it, too.
 """
 
+import argparse
+import json
+import time
 from dataclasses import dataclass
 
 ON_POLICY = ("ippo", "ippo_shared", "mappo")
@@ -49,3 +52,18 @@ def vf_coef(algorithm: str) -> float:
 def is_continuous(algorithm: str) -> bool:
     """Return whether the actions are velocities: BenchMARL's MADDPG takes no others."""
     return algorithm == "maddpg"
+
+
+def arguments(description: str | None) -> argparse.Namespace:
+    """Return the arguments of a program that trains one algorithm with one seed, and plays."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("algorithm", choices=(*ON_POLICY, *OFF_POLICY))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--episodes", type=int, default=320)
+    return parser.parse_args()
+
+
+def print_answer(returns: list[float]) -> None:
+    """Print the returns of the episodes and the CPU seconds so far, as ``benchmarks.strength`` reads them."""
+    print(json.dumps({"returns": returns, "seconds": time.process_time()}))
