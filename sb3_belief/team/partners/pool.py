@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy as copied
+from dataclasses import replace
 from numbers import Real
 from typing import Any
 
@@ -88,9 +90,9 @@ class PartnerPool:
 
         :param seed: Seed of the draws, >= 0
         """
-        schedule = self.schedule
-        weights = list(self.weights.values())
-        return PartnerPool(self.members, schedule.every, schedule.unit, schedule.per_copy, weights, seed, self.held_out)
+        pool = copied(self)
+        pool.schedule = replace(self.schedule, seed=seed)
+        return pool
 
     def _only(self, names: Sequence[str], schedule: RedrawSchedule) -> "PartnerPool":
         return PartnerPool(
