@@ -191,20 +191,7 @@ def test_a_suite_that_is_asked_for_is_listed_in_full(monkeypatch):
     [(16, [], False), (8, [], True), (8, ["rollout_steps:8"], False), (8, ["redraw_unit:episodes", "per_copy:true"], False)],
 )
 def test_rollouts_that_the_environment_counts_otherwise_are_named(tmp_path, n_steps, env_kwargs, warns):
-    words = [
-        "--algo",
-        "ippo",
-        "--env",
-        "convention-redraw",
-        "-f",
-        str(tmp_path),
-        "--verbose",
-        "0",
-        "--eval-freq",
-        "-1",
-        "-n",
-        "32",
-    ]
+    words = ["-f", str(tmp_path), *"--algo ippo --env convention-redraw --verbose 0 --eval-freq -1 -n 32".split()]
     words += ["--env-kwargs", *env_kwargs] if env_kwargs else []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
