@@ -17,11 +17,19 @@ import sys
 from multiprocessing import forkserver
 
 #: What workers need
-WORKERS_NEED = ["sb3_belief.team", "sb3_belief.belief_ppo", "sb3_contrib", "mpe2.simple_spread_v3", "lbforaging"]
+WORKERS_NEED = [
+    "torch._dynamo",
+    "sb3_belief.team",
+    "sb3_belief.belief_ppo",
+    "sb3_contrib",
+    "mpe2.simple_spread_v3",
+    "lbforaging",
+]
 
 
 def _import_all() -> None:
     import torch as th
+    import torch._dynamo  # what the first optimizer would import
 
     import sb3_belief.belief_ppo
     import sb3_belief.cli.main

@@ -1,14 +1,19 @@
 """
-A training that is hit at a known moment: ``python interrupted.py MOMENT SIGNAL TIMES words of train.py``.
+A training that is hit at a known moment.
 
-The signal is sent by the process to itself, so that it comes exactly then. TIMES says how often, 50 ms apart.
+It runs in a process of its own, which sends the signal to itself, so that it comes exactly then. That process is forked
+from the server from which workers start, since it would take longer to import everything than to train.
 """
 
+import multiprocessing
 import os
 import signal
+import subprocess
 import sys
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 from stable_baselines3 import PPO
 
@@ -82,15 +87,37 @@ def slow_saves(seconds):
     os.fsync = fsync
 
 
-if __name__ == "__main__":
-    moment, name, times, *words = sys.argv[1:]
+def run_interrupted(moment, name, words, times=1):
+    """
+    Run ``train`` in a process of its own that is hit by a signal, and return how it has ended and what it has said.
+
+    :param moment: One of ``MOMENTS``
+    :param name: Name of the signal
+    :param words: Words of the command line
+    :param times: How often the signal comes, 50 ms apart
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        outputs = [Path(folder, each) for each in ("stdout", "stderr")]
+        process = multiprocessing.get_context("forkserver").Process(target=_train, args=(moment, name, times, words, outputs))
+        process.start()
+        process.join()
+        return subprocess.CompletedProcess(words, process.exitcode, *(path.read_text() for path in outputs))
+
+
+def _train(moment, name, times, words, outputs):
+    for path, descriptor in zip(outputs, (1, 2), strict=True):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), descriptor)
+    # A process started in the background may ignore Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def action():
-        if int(times) > 1:
+        if times > 1:
             # The next signals come while the state is saved
             slow_saves(0.3)
-        hit(getattr(signal, name), int(times))
+        hit(getattr(signal, name), times)
 
+    # Its workers start from a server of its own
+    multiprocessing.set_forkserver_preload(["sb3_belief.team", "torch._dynamo"])
     prepare(moment, action)
     sys.argv[1:] = words
     sys.exit(train_main())

@@ -4,16 +4,12 @@ import errno
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import warnings
-from pathlib import Path
 
 import pytest
 
-import sb3_belief
 import sb3_belief.common.durable_files as durable_files
 from sb3_belief.cli.main import train_main
 from sb3_belief.team import Team
@@ -37,18 +33,7 @@ def undisturbed(tmp_path_factory):
 
 def interrupt(folder, moment, name, times=1):
     """Run a training in a process of its own that is hit by a signal."""
-    root = Path(sb3_belief.__file__).parents[1]
-    words = [*WORDS, "-f", str(folder), "-params", *SETTINGS]
-    command = [sys.executable, "-m", "tests.zoo.interrupted", moment, name, str(times), *words]
-    # A process started in the background may ignore Ctrl-C
-    result = subprocess.run(
-        command,
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
+    result = interrupted.run_interrupted(moment, name, [*WORDS, "-f", str(folder), "-params", *SETTINGS], times)
     return result, run_folder(folder)
 
 

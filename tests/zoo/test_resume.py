@@ -4,16 +4,12 @@ import json
 import multiprocessing
 import os
 import shutil
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-import sb3_belief
 from sb3_belief.cli.main import main, train_main
 from sb3_belief.team import Team, TeamVecEnv
 from sb3_belief.zoo.endings import Interrupted, SignalCheck
@@ -22,6 +18,7 @@ from sb3_belief.zoo.resume import resume_config
 from sb3_belief.zoo.run_folder import find_team, whole_checkpoints
 from sb3_belief.zoo.run_lock import run_lock
 from sb3_belief.zoo.train_options import TrainOptions
+from tests.zoo.interrupted import run_interrupted
 from tests.zoo.runs import EASY, SETTINGS, TOTAL, WORDS, check_same_run, record_of, run_folder, table, train
 
 
@@ -34,14 +31,7 @@ def undisturbed(tmp_path_factory):
 
 def kill(folder, moment, words):
     """Run a training in a process of its own that is killed at a moment."""
-    root = Path(sb3_belief.__file__).parents[1]
-    result = subprocess.run(
-        [sys.executable, "-m", "tests.zoo.interrupted", moment, "SIGKILL", "1", *words, "-f", str(folder)],
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-    )
+    result = run_interrupted(moment, "SIGKILL", [*words, "-f", str(folder)])
     assert result.returncode == -9, result.stderr
     return run_folder(folder)
 
