@@ -101,6 +101,7 @@ def run_interrupted(moment, name, words, times=1):
         process = multiprocessing.get_context("forkserver").Process(target=_train, args=(moment, name, times, words, outputs))
         process.start()
         process.join()
+        assert process.exitcode is not None
         return subprocess.CompletedProcess(words, process.exitcode, *(path.read_text() for path in outputs))
 
 
