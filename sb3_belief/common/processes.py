@@ -17,11 +17,16 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
+
 if sys.platform != "win32":
     import fcntl
+    from multiprocessing import forkserver
 
 #: Seconds that a worker gets to finish what it is at before it is killed, and how many times what it took at most so far
 PATIENCE, PATIENCE_FACTOR = 2.0, 3.0
+# The second is what torch imports when the first optimizer is made
+_WORKERS_NEED = ["sb3_belief.team", "torch._dynamo"]
 # Signals that ask a process to end. The main process decides what they mean for its workers
 _END_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _ASKING = [int(number) for number in (signal.SIGINT, *_END_SIGNALS)]
@@ -64,6 +69,19 @@ def check_may_have_workers(what: str, instead: str) -> None:
         )
 
 
+def _preload() -> None:
+    """
+    Have the server from which workers are forked import what they need, beside what the program has it import.
+
+    Otherwise each of them imports that by itself: on two busy cores a short run with eight copies in processes and two jobs
+    took 98 s instead of 34, and with two copies it made no difference. A server that runs already stays as it is.
+    """
+    if sys.platform == "win32":
+        return
+    modules = getattr(forkserver._forkserver, "_preload_modules", ["__main__"])
+    multiprocessing.set_forkserver_preload([*modules, *(name for name in _WORKERS_NEED if name not in modules)])
+
+
 def start_worker(target: Callable[..., None], args: tuple[Any, ...], name: str | None = None) -> Any:
     """
     Start a worker, which is killed at the latest when this process ends.
@@ -73,6 +91,7 @@ def start_worker(target: Callable[..., None], args: tuple[Any, ...], name: str |
     :param name: Name of the process
     :return: The ``multiprocessing`` process
     """
+    _preload()
     process = start_context().Process(target=target, args=args, name=name, daemon=True)
     process.start()
     _started.add(process)
@@ -96,6 +115,8 @@ def become_worker() -> None:
             signal.siginterrupt(number, False)
     if hasattr(os, "setpgrp"):
         os.setpgrp()
+    # Those that are forked from one server would all draw the same
+    np.random.seed()
     _end_with_parent()
 
 

@@ -8,6 +8,7 @@ import time
 import uuid
 from multiprocessing import forkserver
 
+import numpy as np
 import pytest
 
 from sb3_belief.common import processes
@@ -107,6 +108,23 @@ def answers_late(connection):
     connection.recv()
 
 
+def draws(connection):
+    processes.become_worker()
+    connection.send(np.random.random())
+
+
+def test_workers_do_not_draw_the_same_numbers():
+    """Environments that have no seed of their own, or do not use it, would be copies of each other."""
+    drawn = []
+    for _ in range(2):
+        here, there = start_context().Pipe()
+        process = start_worker(draws, (there,))
+        there.close()
+        drawn.append(here.recv())
+        process.join()
+    assert drawn[0] != drawn[1]
+
+
 def test_an_inbox_waits_until_a_deadline():
     here, there = start_context().Pipe()
     process = start_worker(answers_late, (there,))
@@ -160,13 +178,15 @@ def test_a_process_of_multiprocessing_ends_with_workers_that_it_still_holds(meth
         from sb3_belief.common import processes
         held = []
         def work(connection):
+            # Imported once for all, not by each
+            imported = "torch._dynamo" in sys.modules
             processes.become_worker()
-            connection.send("ready")
+            connection.send(imported)
             time.sleep(1000)
         def train():
             here, there = multiprocessing.Pipe()
             held.append(processes.start_worker(work, (there,)))
-            assert here.recv() == "ready"
+            assert here.recv() is True
         if __name__ == "__main__":
             process = multiprocessing.get_context("{method}").Process(target=train)
             process.start()

@@ -117,8 +117,6 @@ def _train(moment, name, times, words, outputs):
             slow_saves(0.3)
         hit(getattr(signal, name), times)
 
-    # Its workers start from a server of its own
-    multiprocessing.set_forkserver_preload(["sb3_belief.team", "torch._dynamo"])
     prepare(moment, action)
     sys.argv[1:] = words
     sys.exit(train_main())
