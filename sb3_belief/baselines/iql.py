@@ -34,8 +34,8 @@ class IQL(SafeFilesMixin, DQN):
       target. A truncated episode's last masks come as ``info["terminal_action_masks"]``; where an environment does not say
       them, all actions count as possible there.
     - Each copy of the environment tosses its own coin for exploration. SB3's DQN tosses one for all copies.
-    - Steps between two lives of the agent, in which it is out of play, are not learned from. Those of a dead agent whose
-      return runs on are: its only action has a value, on which the target before its death relies.
+    - Steps before the agent's first life and between two, in which it is out of play, are not learned from. Those of a dead
+      agent whose return runs on are: its only action has a value, on which the target before its death relies.
 
     Without masks, with ``double_q=False`` and one copy it is SB3's DQN, weight for weight.
 
@@ -103,8 +103,8 @@ class IQL(SafeFilesMixin, DQN):
         self.double_q = double_q
         #: Whether the environment has given masks, without which the agent then acts otherwise than in training
         self.learned_with_masks = False
-        # Where the agent's life has ended and the next one has not begun, bool [n_envs]
-        self._between_lives = np.zeros(0, dtype=bool)
+        # Where the agent's own return runs: since the first step of a life in which it was in play, bool [n_envs]
+        self._return_runs = np.zeros(0, dtype=bool)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -210,9 +210,9 @@ class IQL(SafeFilesMixin, DQN):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps or self._last_obs is None or len(self._between_lives) != self.n_envs:
+        if reset_num_timesteps or self._last_obs is None or len(self._return_runs) != self.n_envs:
             # SB3 resets the environment
-            self._between_lives = np.zeros(self.n_envs, dtype=bool)
+            self._return_runs = np.zeros(self.n_envs, dtype=bool)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _store_transition(
@@ -242,10 +242,8 @@ class IQL(SafeFilesMixin, DQN):
     def _learnable(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Return in which copies the agent's own return ran during a step."""
         active = np.array([info.get("active", True) for info in infos], dtype=bool)
-        learnable = active | ~self._between_lives
-        # At the end of the team's episode the next return begins with the next episode
-        life_ends = np.array([done and "episode" not in info for done, info in zip(dones, infos, strict=True)])
-        self._between_lives = ~learnable & ~dones | life_ends
+        learnable = active | self._return_runs
+        self._return_runs = learnable & ~dones
         return learnable
 
     def learn(

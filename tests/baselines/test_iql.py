@@ -223,6 +223,17 @@ def test_the_dead_learn_while_their_return_runs_on_and_a_limit_cuts_it_off():
     assert (buffer.actions[4:7, 0, 0] == 0).all()
 
 
+def test_steps_before_the_first_life_are_not_learned_from():
+    class Joins(ToyEnv):
+        """The first agent joins at step 3."""
+
+        def infos(self):
+            return {agent: {"active": agent != "agent_0" or self.t > 3, "next_active": self.t >= 3} for agent in self.agents}
+
+    buffer = played(make_team_env(Joins, n_envs=2, seed=0), 28).replay_buffer
+    assert buffer.learnable[:14, 0].tolist() == buffer.learnable[:14, 1].tolist() == ([False] * 3 + [True] * 4) * 2
+
+
 def test_masks_at_a_limit_are_those_of_the_old_episode():
     model = played(make_team_env(MaskedEnv, n_envs=2, seed=0), 14)
     masks = model.replay_buffer.next_masks
