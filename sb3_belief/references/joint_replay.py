@@ -19,6 +19,7 @@ class JointSamples(NamedTuple):
     :param rewards: The agents' own rewards, ``[B, n]``
     :param ends: Whether an agent's own return ended, 1 or 0, ``[B, n]``
     :param in_play: Whether an agent was in play when it acted, 1 or 0, ``[B, n]``
+    :param return_runs: Whether an agent's own return ran, 1 or 0, ``[B, n]``: that of a dead one does until it ends
     """
 
     observations: dict[str, th.Tensor]
@@ -27,6 +28,7 @@ class JointSamples(NamedTuple):
     rewards: th.Tensor
     ends: th.Tensor
     in_play: th.Tensor
+    return_runs: th.Tensor
 
 
 class JointReplayBuffer(DictReplayBuffer):
@@ -40,8 +42,15 @@ class JointReplayBuffer(DictReplayBuffer):
         super().__init__(*args, **kwargs)
         agents: Any = self.observation_space["active"]
         shape = (self.buffer_size, self.n_envs, *agents.shape)
-        #: The agents' own rewards, ends and whether they were in play, float32 ``[buffer_size, n_envs, n]``
-        self.own_rewards, self.own_ends, self.in_play = (np.zeros(shape, dtype=np.float32) for _ in range(3))
+        #: The agents' own rewards, ends, whether they were in play and whether their returns ran, float32
+        #: ``[buffer_size, n_envs, n]``
+        self.own_rewards, self.own_ends, self.in_play, self.return_runs = (np.zeros(shape, dtype=np.float32) for _ in range(4))
+        # Whose return has begun and not ended after the last step, bool [n_envs, n]
+        self._running = np.zeros(shape[1:], dtype=bool)
+
+    def begin_episodes(self) -> None:
+        """Note that all copies are at the beginning of an episode, without an end before it."""
+        self._running[:] = False
 
     def add(
         self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
@@ -49,11 +58,15 @@ class JointReplayBuffer(DictReplayBuffer):
         pos = self.pos
         for array, key in ((self.own_rewards, "own_rewards"), (self.own_ends, "own_ends"), (self.in_play, "in_play")):
             array[pos] = [info[key] for info in infos]
+        runs = self._running | (self.in_play[pos] > 0)
+        self.return_runs[pos] = runs
+        self._running = runs & ~np.asarray(done, dtype=bool)[:, None]
         super().add(obs, next_obs, action, reward, done, infos)
         for copy, info in enumerate(infos):
             for agent, row in info.get("last_obs", {}).items():
                 # What follows is not of this return any more
                 self.next_observations["obs"][pos, copy, agent] = row
+                self._running[copy, agent] = False
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
@@ -63,5 +76,5 @@ class JointReplayBuffer(DictReplayBuffer):
             {key: self.to_torch(part[at]) for key, part in parts.items()}
             for parts in (self.observations, self.next_observations)
         )
-        rows = (self.to_torch(array[at]) for array in (self.own_rewards, self.own_ends, self.in_play))
+        rows = (self.to_torch(array[at]) for array in (self.own_rewards, self.own_ends, self.in_play, self.return_runs))
         return JointSamples(obs, self.to_torch(self.actions[at]), next_obs, *rows)

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -122,6 +123,20 @@ class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
             self.action_noise = NormalActionNoise(np.zeros(shape), np.full(shape, self.exploration_noise))
         super()._setup_model()
 
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            # SB3 resets the environment
+            assert isinstance(self.replay_buffer, JointReplayBuffer)
+            self.replay_buffer.begin_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -171,15 +186,15 @@ class MADDPG(JointLearnerMixin, OffPolicyAlgorithm):
 
     def critic_loss(self, samples: JointSamples) -> th.Tensor:
         """
-        Return the critics' mean squared errors, each over the steps in which its agent was in play.
+        Return the critics' mean squared errors, each over the steps in which its agent's own return ran: those of a dead agent
+        as well, on whose values the target before its death relies, and not those between two lives.
 
         :param samples: ``B`` joint steps
         :return: Their sum over the agents, a number
         """
         policy = self.policy
         values = policy.critic_values(policy.critics, samples.observations["state"], policy.joint(samples.actions))
-        # Between two lives an agent has no return
-        return sum_of_means((values - self.targets(samples)) ** 2, samples.in_play)
+        return sum_of_means((values - self.targets(samples)) ** 2, samples.return_runs)
 
     def actor_loss(self, samples: JointSamples) -> th.Tensor:
         """

@@ -146,15 +146,15 @@ def maddpg_actor_loss(values: th.Tensor, outputs: th.Tensor, in_play: th.Tensor,
     return sum_of_means(coef * squares - values, in_play)
 
 
-def sum_of_means(losses: th.Tensor, in_play: th.Tensor) -> th.Tensor:
+def sum_of_means(losses: th.Tensor, counts: th.Tensor) -> th.Tensor:
     """
-    Return the sum over the agents of each one's mean loss over the steps in which it was in play.
+    Return the sum over the agents of each one's mean loss over the steps that count.
 
     :param losses: ``[B, n]``
-    :param in_play: 1 for an agent in play, otherwise 0, ``[B, n]``
-    :return: A number; nothing of an agent that was never in play
+    :param counts: 1 for a step of an agent that counts, otherwise 0, ``[B, n]``
+    :return: A number; nothing of an agent of which no step counts
     """
-    return ((in_play * losses).sum(dim=0) / in_play.sum(dim=0).clamp(min=1)).sum()
+    return ((counts * losses).sum(dim=0) / counts.sum(dim=0).clamp(min=1)).sum()
 
 
 def _networks(n_agents: int, n_in: int, n_out: int, net_arch: list[int]) -> nn.Sequential:

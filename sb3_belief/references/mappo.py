@@ -77,7 +77,8 @@ class CentralNetworks(MlpExtractor):
     ) -> None:
         super().__init__(features_dim, net_arch, activation_fn, device)
         self.own_dim = own_dim
-        self.policy_net = MlpExtractor(own_dim, net_arch, activation_fn, device).policy_net
+        actor = MlpExtractor(own_dim, net_arch, activation_fn, device)
+        self.policy_net, self.latent_dim_pi = actor.policy_net, actor.latent_dim_pi
 
     def forward_actor(self, features: th.Tensor) -> th.Tensor:
         """

@@ -45,7 +45,8 @@ def test_the_gradient_by_hand(monkeypatch):
     monkeypatch.setattr(policy, "critic_values", lambda critics, state, actions: -((actions.sum(dim=(-1, -2)) - 1) ** 2).T)
     assert model.env is not None
     obs = policy.obs_to_tensor(model.env.reset())[0]
-    samples = JointSamples(obs, th.tensor([[-0.3, 0.5]]), obs, th.zeros(1, 2), th.zeros(1, 2), th.tensor([[1.0, 0.0]]))
+    first = th.tensor([[1.0, 0.0]])
+    samples = JointSamples(obs, th.tensor([[-0.3, 0.5]]), obs, th.zeros(1, 2), th.zeros(1, 2), first, first)
     loss = model.actor_loss(samples)
     loss.backward()
     assert loss.item() == pytest.approx(0.09, abs=1e-5)
@@ -103,6 +104,47 @@ def test_each_agent_has_rewards_and_ends_of_its_own():
     cut = learner(joint_env(n_envs=1, truncates=True), train_freq=100).learn(3)
     assert not cut.replay_buffer.own_ends[:3].any()
     assert cut.replay_buffer.next_observations["state"][2, 0].tolist() == [3, 30]
+
+
+class RunsOn(CountingTeam):
+    """As where the team's reward is everybody's: "b" is dead after step 1, and its return runs on."""
+
+    def _infos(self):
+        infos = super()._infos()
+        return {**infos, "b": {**infos["b"], "active": self.t <= 1, "next_active": self.t < 1}}
+
+
+def test_the_critic_of_a_dead_agent_learns_while_its_return_runs_on():
+    model = learner(JointVecEnv(make_team_env(RunsOn, n_envs=1)), train_freq=1, learning_starts=100)
+    model.learn(2)
+    # As if the environment had been left in the middle of an episode, in which "b" was dead
+    model.learn(6)
+    buffer = model.replay_buffer
+    assert buffer.in_play[:8, 0, 1].tolist() == [1, 0] + [1, 0, 0] * 2
+    assert buffer.return_runs[:8, 0].all()
+    samples = buffer._get_samples(np.arange(2, 5))
+
+    def losses(rewards):
+        th.manual_seed(0)
+        asked = samples._replace(rewards=rewards)
+        return model.critic_loss(asked).item(), model.actor_loss(asked).item()
+
+    later = samples.rewards.clone()
+    later[1:, 1] += 1000
+    (critic, actor), (critic_before, actor_before) = losses(later), losses(samples.rewards)
+    assert critic > critic_before + 1000 and actor == actor_before
+
+
+def test_steps_before_the_first_life_train_nobody():
+    class Joins(CountingTeam):
+        """The second agent joins at step 2."""
+
+        def _infos(self):
+            infos = super()._infos()
+            return {**infos, "b": {**infos["b"], "active": self.t > 1, "next_active": self.t > 0}}
+
+    buffer = learner(JointVecEnv(make_team_env(Joins, n_envs=1)), train_freq=100, learning_starts=100).learn(6).replay_buffer
+    assert buffer.return_runs[:6, 0, 1].tolist() == buffer.in_play[:6, 0, 1].tolist() == [0, 1, 1] * 2
 
 
 def test_agents_share_nothing():

@@ -186,6 +186,15 @@ print(json.dumps(model.predict(obs, deterministic=True)[0].tolist()))
 """
 
 
+@pytest.mark.parametrize("net_arch", [[], {"vf": [16]}, {"pi": [8], "vf": [16]}])
+def test_actor_and_critic_have_layers_of_their_own(net_arch):
+    team = make_team(policy_kwargs=dict(net_arch=net_arch)).learn(28)
+    policy = team.agents["agent_0"].policy
+    hidden = [layer.out_features for layer in policy.mlp_extractor.policy_net if isinstance(layer, th.nn.Linear)]
+    assert hidden == ([8] if "pi" in net_arch else [])
+    assert policy.action_net.in_features == (8 if hidden else policy.features_extractor.own_dim)
+
+
 def test_its_zip_loads_alone_in_a_fresh_process(tmp_path):
     team = make_team(**LIKE_ITS_AUTHORS).learn(28)
     model = team.agents["agent_0"]
