@@ -108,6 +108,14 @@ class AdaptiveExtractor(BeliefExtractor):
         self._set_rows(newest(followed_by(self.history, rows), self.options.history_length))
         self._set_clock(now, self.n_copies if n_copies is None else n_copies)
 
+    def pass_time(self, steps: int) -> None:
+        """
+        Let the next step be a later one.
+
+        :param steps: How many steps have passed of which there is nothing to remember, or not yet
+        """
+        self._set_clock(self.clock + steps, self.n_copies)
+
     def remember_steps(
         self, rows: tuple[th.Tensor, th.Tensor, th.Tensor], visible: th.Tensor, copies: np.ndarray | None
     ) -> None:
@@ -236,11 +244,21 @@ def to_be_replayed(table: Memory, flat: th.Tensor, minibatch: BeliefMinibatch) -
     """
     Return steps of a rollout as a rollout buffer keeps them, and a checkpoint saves them.
 
+    Of the table only the rows that these steps attended to are kept: the others would cost memory, and time to encode them.
+
     :param table: What they attended to
     :param flat: Their preprocessed flat observations, ``[B, d_o]``
     :param minibatch: Their part of the belief
     :return: Arrays by name
     """
+    selected: Any = minibatch.selected
+    kept = selected[selected >= 0].unique().long()
+    # A table has at least one row
+    kept = kept if len(kept) else th.arange(min(1, len(table.valid)), device=kept.device)
+    place = th.full((len(table.valid) + 1,), -1, dtype=selected.dtype, device=kept.device)
+    place[kept] = th.arange(len(kept), dtype=selected.dtype, device=kept.device)
+    # -1, the null row, finds the last place
+    table, minibatch = Memory(*(rows[kept] for rows in table)), minibatch._replace(selected=place[selected.long()])
     parts = {f"table_{name}": rows for name, rows in table._asdict().items()}
     parts |= {f"minibatch_{name}": rows for name, rows in minibatch._asdict().items() if rows is not None}
     return {name: rows.cpu().numpy().copy() for name, rows in {**parts, "flat": flat}.items()}

@@ -146,6 +146,11 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
         variant = self._options.variant if self.others_action_spaces else None
         attends = variant is not None and variant.attends
         rows = self.history_length if attends and sees_all else 0
+        if rows and variant is not None and variant.online:
+            # What is attended to in a rollout that is replayed, at most
+            rows += self.belief_replay * min(
+                REPLAYED_ROWS * (self.n_own + self.n_pool), self.history_length + self.n_steps * self.n_envs
+            )
         width = self.policy_kwargs.get("embedding_dim", EMBEDDING_DIM)
         warn_of_memory(self.observation_space, self.n_steps, self.n_envs, rows, width)
 
@@ -176,6 +181,14 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
     def _check_others(self, env: VecEnv) -> None:
         if self.belief != "none":
             check_same_others(env, self.others_action_spaces)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        if getattr(self.policy, "is_kept", False):
+            raise ValueError(
+                "learn() within observing(): what the agent remembers is put back when the block ends, and would be mixed with"
+                " its training until then. Open observing() around the evaluation alone, in a callback's own method."
+            )
+        return super()._setup_learn(*args, **kwargs)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         refuse_many_agents(env, type(self).__name__)
@@ -231,7 +244,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
                 )
                 buffer.replay = [*buffer.replay, to_be_replayed(extractor.attended(), *part)][-self.belief_replay :]
             extractor.table, extractor.replay = None, []
-            extractor.append(self.remembered(0, buffer.buffer_size), extractor.clock + buffer.buffer_size)
+            extractor.append(self.remembered(0, buffer.buffer_size), extractor.clock)
         else:
             policy.remember(observations, actions)
 
@@ -252,6 +265,8 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
             return super().collect_rollouts(*args, **kwargs)
         finally:
             extractor.online = None
+            # Also if there will be no update, since the agent was out of play all the time, or is stopped here
+            extractor.pass_time(self.rollout_buffer.pos)
 
     @th.no_grad()
     def remembered(self, first: int, last: int) -> Memory:
@@ -274,6 +289,7 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
         actions, active = buffer.actions[rows].reshape(len(flat), *(self.action_space.shape or ())), buffer.active[rows]
         if isinstance(self.action_space, spaces.Box):
             # As the environment got them
+            actions = policy.unscale_action(actions) if policy.squash_output else actions
             actions = np.clip(actions, self.action_space.low, self.action_space.high)
         own = policy.own_rows(actions, buffer.own_rewards[rows].reshape(-1), len(flat))
         # Whoever waits does nothing

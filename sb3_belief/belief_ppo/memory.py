@@ -42,7 +42,7 @@ def warn_of_memory(
     :param observation_space: Of the agent
     :param n_steps: Steps of a rollout
     :param n_envs: Copies of the environment
-    :param history_length: Rows of the history that hold whole observations; 0 for none
+    :param history_length: Rows of the history, and of what is replayed, that hold whole observations; 0 for none
     :param embedding_dim: Width of the embedding of a whole observation
     """
     rollout = n_steps * n_envs * observation_bytes(observation_space)

@@ -1,6 +1,6 @@
 """The options of a belief, and checks of what makes no sense."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
@@ -76,13 +76,14 @@ class BeliefOptions:
             )
         if self.belief == "adaptive" and self.n_own + self.n_pool == 0:
             raise ValueError("n_own and n_pool are 0, so nothing would be attended to; for such a belief use belief='static'.")
-        if isinstance(self.row_features, str):
+        if not isinstance(self.row_features, Iterable) or isinstance(self.row_features, str):
             raise ValueError(f"row_features is {self.row_features!r}; it must be a list of some of {', '.join(ROW_FEATURES)}")
         # Lists come from YAML and from files
         object.__setattr__(self, "row_features", tuple(self.row_features))
         for name in self.row_features:
             _check_choice("row_features: an entry", name, ROW_FEATURES)
-        if not 0 <= self.history_dropout < 1:
+        dropout = self.history_dropout
+        if isinstance(dropout, bool) or not isinstance(dropout, int | float) or not 0 <= dropout < 1:
             raise ValueError(f"history_dropout is {self.history_dropout!r}; it must be in [0, 1): a share of the steps")
 
     @property

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -24,6 +25,8 @@ class RememberingMixin(BeliefNetworksMixin):
 
     #: Its features extractor
     _extractor: BeliefExtractor
+    #: Whether what it remembers is put back afterwards (``team.observing``), so that it must not train meanwhile
+    is_kept = False
 
     @property
     def belief(self) -> DynamicBelief | None:
@@ -80,10 +83,15 @@ class RememberingMixin(BeliefNetworksMixin):
         :param acted: In a game in turns, at which of the steps it was the agent's turn, bool ``[N]``: an adaptive belief also
             remembers what it sees while it waits, with its observation at its last turn. At all of them if it is left out
         :raises ValueError: If a name is unknown, something is not of this shape or no action of its space, or an observation
-            is not finite
+            is not finite; or within a rollout of an adaptive belief's training, which remembers its own steps by itself
         """
         if self.history is None:
             return
+        if not self.is_kept and getattr(self._extractor, "online", None) is not None:
+            raise ValueError(
+                "the agent is in a rollout of its training, whose steps it remembers by itself, and its update would attend to"
+                " other rows than acting did: remember after learn(), or evaluate within sb3_belief.team.observing"
+            )
         # A tensor that is made in inference mode could never be trained on
         with th.inference_mode(False), th.no_grad():
             # obs_to_tensor() accepts images with the channels last, as the environment returns them
@@ -100,26 +108,31 @@ class RememberingMixin(BeliefNetworksMixin):
                 return
             if copies is not None:
                 copies = np.asarray(copies)
-                if copies.shape != (len(rows),) or copies.dtype.kind != "i" or (copies < 0).any():
+                if copies.shape != (len(rows),) or copies.dtype.kind not in "iu" or (copies < 0).any():
                     raise ValueError(f"copies must be integers of at least 0 of the shape {(len(rows),)}, not {copies!r}")
-            own_rows = self.own_rows(own_actions, rewards, len(rows))
-            if acted is not None:
-                if np.shape(acted) != (len(rows),) or np.asarray(acted).dtype != bool:
-                    raise ValueError(f"acted must be one truth value for each of the {len(rows)} steps, not {acted!r}")
-                own_rows[~np.asarray(acted), :-1] = 0.0
-            own = th.as_tensor(own_rows, device=self.device)
+                copies = copies.astype(np.int64)
+                if len(np.unique(copies)) < len(copies):
+                    raise ValueError(f"copies must each be another one, since all are of one step, not {copies!r}")
+            acted = np.ones(len(rows), dtype=bool) if acted is None else np.asarray(acted)
+            if acted.shape != (len(rows),) or acted.dtype != bool:
+                raise ValueError(f"acted must be one truth value for each of the {len(rows)} steps, not {acted!r}")
+            own = th.as_tensor(self.own_rows(own_actions, rewards, len(rows), acted), device=self.device)
             anybody = th.as_tensor(seen.any(axis=1), device=self.device)
             self._extractor.remember_steps((rows, actions_seen, own), anybody, copies)
 
-    def own_rows(self, actions: np.ndarray | None, rewards: np.ndarray | None, n_steps: int) -> np.ndarray:
+    def own_rows(
+        self, actions: np.ndarray | None, rewards: np.ndarray | None, n_steps: int, acted: np.ndarray | None = None
+    ) -> np.ndarray:
         """
         Return the agent's own part of some steps, as an adaptive belief remembers it.
 
         :param actions: Its actions, ``[N, ...]``, or a single one where N is 1; None for zeros
         :param rewards: Its rewards, ``[N]``, or a single one where N is 1; None for zeros
         :param n_steps: ``N``
+        :param acted: At which steps it acted, bool ``[N]``, of which alone the actions count and are checked; None for actions
+            that are known to be of its space, at all steps
         :return: float32 ``[N, U + 1]``
-        :raises ValueError: If one of them has another shape, or is not finite
+        :raises ValueError: If one of them has another shape, or is not finite, or an action is none of its space
         """
         encoder = RowEncoder("the agent", self.action_space)
         own = np.zeros((n_steps, encoder.width + 1), dtype=np.float32)
@@ -134,17 +147,41 @@ class RememberingMixin(BeliefNetworksMixin):
                 values = values[None]
             if values.shape != shape or not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite numbers of the shape {shape}, not {values!r}")
-            own[:, columns] = encoder(values) if name == "own_actions" else values[:, None]
+            if name == "rewards":
+                own[:, columns] = values[:, None]
+            elif acted is None:
+                own[:, columns] = encoder(values)
+            else:
+                self._check_actions(values[acted])
+                own[acted, columns] = encoder(values[acted])
         return own
+
+    def _check_actions(self, actions: np.ndarray) -> None:
+        # Numbers may lie beyond their bounds, to which the environment clips them
+        if not isinstance(self.action_space, spaces.Box):
+            for action in actions:
+                if not self.action_space.contains(action):
+                    raise ValueError(f"own_actions has {action!r}, which is no action of {self.action_space}")
 
     def end_episodes(self, copies: np.ndarray | None = None) -> None:
         """
         Tell a deployed agent that an episode has ended: what follows is another one. Only the adaptive belief knows of them.
 
         :param copies: In which copies, as of :meth:`remember`, int ``[n]``; None for all in which it acts
+        :raises ValueError: If these are no numbers of copies
         """
+        if copies is not None:
+            copies = np.asarray(copies)
+            if copies.ndim != 1 or (copies.size and copies.dtype.kind not in "iu") or (copies < 0).any():
+                raise ValueError(f"copies must be a list of integers of at least 0, or None for all, not {copies!r}")
+            copies = copies.astype(np.int64)
         if self.has_belief and isinstance(self._extractor, AdaptiveExtractor):
             self._extractor.end_episodes(copies)
+
+    def pass_time(self) -> None:
+        """Note a step at which there was nothing to remember. Only the adaptive belief knows how long ago something was."""
+        if self.has_belief and isinstance(self._extractor, AdaptiveExtractor):
+            self._extractor.pass_time(1)
 
     def memory_state(self) -> dict[str, th.Tensor]:
         """Return all that is remembered, for :meth:`restore_memory_state`; empty for a belief without a history."""

@@ -71,7 +71,7 @@ class RowEncoder:
         :param values: ``[n, ...]``, each in the space
         :return: float32 ``[n, width]``; these values themselves where they need no other form
         """
-        rows = values.reshape(len(values), -1)
+        rows = values.reshape(len(values), int(np.prod(values.shape[1:])))
         if self._offsets is None:
             return rows.astype(np.float32, copy=False)
         encoded = np.zeros((len(rows), self.width), dtype=np.float32)

@@ -118,6 +118,8 @@ class ObservingVecEnv(VecEnvWrapper):
                 copies=rows,
             )
             self.steps[agent] += len(active)
+        elif self.most_steps is None or self.steps[agent] < self.most_steps:
+            policy.pass_time()
         goes_on |= seen.active
         goes_on &= ~seen.dones
         if seen.dones.any():
@@ -228,13 +230,17 @@ def observing(
 @contextmanager
 def kept_memories(policies: Iterable[BeliefPolicyMixin]) -> Iterator[None]:
     """
-    Put back afterwards what policies remember, whatever they have remembered and been told meanwhile.
+    Put back afterwards what policies remember, whatever they have remembered and been told meanwhile. They cannot learn
+    meanwhile.
 
     :param policies: The policies
     """
-    states = [(policy, policy.memory_state()) for policy in policies]
+    states = [(policy, policy.memory_state(), policy.is_kept) for policy in policies]
     try:
+        for policy, _, _ in states:
+            policy.is_kept = True
         yield
     finally:
-        for policy, state in states:
+        for policy, state, was_kept in states:
             policy.restore_memory_state(state)
+            policy.is_kept = was_kept

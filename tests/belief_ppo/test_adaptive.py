@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_belief.belief.adaptive import AdaptiveBelief
 from sb3_belief.belief.memory import valid_rows
+from sb3_belief.belief_ppo import algorithm
 from sb3_belief.belief_ppo.adaptive import replayed
 from tests.belief_ppo.helpers import ALGORITHMS, ROLLOUT, SMALL, make_model, observations_of, same_parameters
 from tests.belief_ppo.test_no_leak import ACTIONS, OBSERVATIONS
@@ -276,6 +277,9 @@ class AtRollouts(BaseCallback):
         (dict(history_dropout=1.0), r"history_dropout is 1.0; it must be in \[0, 1\)"),
         (dict(row_features=["rewards"]), "row_features: an entry is 'rewards'; it must be one of 'own_action', 'reward'"),
         (dict(row_features="reward"), "row_features is 'reward'"),
+        (dict(row_features=None), "row_features is None; it must be a list"),
+        (dict(history_dropout="0.1"), "history_dropout is '0.1'"),
+        (dict(history_dropout=None), "history_dropout is None"),
     ],
 )
 def test_wrong_arguments(kwargs, message):
@@ -287,14 +291,35 @@ def test_past_rollouts_are_replayed():
     model = adaptive(belief_replay=2).learn(3 * ROLLOUT)
     kept = model.rollout_buffer.replay
     last = [int(part["minibatch_stamps"][:, 0].max()) for part in kept]
-    # The last two of three, with the tables of then: their own steps are the last rows
+    # The last two of three, with the tables of then
     assert last == [2 * N_STEPS - 1, 3 * N_STEPS - 1]
     for part, end in zip(kept, last, strict=True):
-        assert part["table_stamps"][:, 0].max() == end and len(part["flat"]) == ROLLOUT
-        # A step attends to earlier ones only
+        assert end - N_STEPS < part["table_stamps"][:, 0].max() < end and len(part["flat"]) == ROLLOUT
         selected, stamps = part["minibatch_selected"], part["minibatch_stamps"]
+        # Nobody attends to what is not there, and nothing is there to which nobody attends
+        assert np.unique(selected[selected >= 0]).tolist() == list(range(len(part["table_stamps"])))
+        # A step attends to earlier ones only
         ages = stamps[:, None, 0] - part["table_stamps"][selected.clip(min=0), 0]
         assert (ages[selected >= 0] > 0).all()
+
+
+def test_what_is_replayed_is_believed_as_it_was():
+    model, found = adaptive(), []
+    real = algorithm.to_be_replayed
+
+    def compared(table, flat, minibatch):
+        kept = replayed(real(table, flat, minibatch), model.device)
+        assert len(kept.table.valid) < len(table.valid)
+        judged = model.policy.features_extractor.judged
+        found.append((judged(flat, minibatch, table).mean, judged(flat, kept.minibatch, kept.table).mean))
+        return real(table, flat, minibatch)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(algorithm, "to_be_replayed", compared)
+        model.learn(3 * ROLLOUT)
+    assert len(found) == 3
+    for whole, part in found:
+        th.testing.assert_close(part, whole, rtol=1e-5, atol=1e-6)
 
 
 def test_a_replay_trains_the_belief_and_leaves_policy_and_value_alone():

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_belief.belief.memory import DEPLOYED, valid_rows
 from sb3_belief.belief_ppo import BeliefPPO
-from tests.belief_ppo.helpers import ROLLOUT, observations_of, same_parameters
-from tests.belief_ppo.test_adaptive import adaptive
+from tests.belief_ppo.helpers import ROLLOUT, SMALL, observations_of, same_parameters
+from tests.belief_ppo.test_adaptive import ADAPTIVE, adaptive
+from tests.belief_ppo.toy_envs import AmongOthers
 
 
 def test_memories_differ_by_copy():
@@ -80,6 +83,9 @@ def test_an_action_of_zeros_is_seen():
     "kwargs, message",
     [
         (dict(own_actions=np.zeros(2)), r"own_actions must be .* shape \(1,\)"),
+        (dict(own_actions=[3]), r"own_actions has .*3.*, which is no action of Discrete\(3\)"),
+        (dict(own_actions=[-1]), r"own_actions has .*-1"),
+        (dict(own_actions=[1.7]), r"own_actions has .*1.7"),
         (dict(rewards=np.zeros((1, 1))), r"rewards must be .* shape \(1,\)"),
         (dict(rewards=np.array([np.nan])), r"rewards must be finite"),
         (dict(copies=np.zeros(2, dtype=int)), r"copies must be .* shape \(1,\)"),
@@ -93,6 +99,90 @@ def test_what_cannot_be_remembered_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         model.policy.remember(observations_of(model, 1), {"b": 1}, **kwargs)
     assert all(th.equal(a, b) for a, b in zip(before, model.policy.history, strict=True))
+
+
+@pytest.mark.parametrize(
+    "space, wrong",
+    [
+        (spaces.MultiDiscrete([2, 3]), [2, 0]),
+        (spaces.MultiDiscrete([2, 3]), [-1, 0]),
+        (spaces.MultiBinary(2), [5, 7]),
+        (spaces.Box(-1, 1, (2,), np.float32), [0, np.inf]),
+    ],
+)
+def test_no_action_of_another_space_is_remembered_unless_the_agent_did_nothing(space, wrong):
+    model = adaptive(env_kwargs=dict(action_space=space))
+    obs = observations_of(model, 1)
+    with pytest.raises(ValueError, match="own_actions"):
+        model.policy.remember(obs, {"b": 1}, own_actions=np.array(wrong))
+    if not isinstance(space, spaces.Box):
+        model.policy.remember(obs, {"b": 1}, own_actions=np.array(wrong), acted=np.array([False]))
+        assert not valid_rows(model.policy.history).own.any()
+    # Those beyond its bounds are clipped by an environment
+    fits = [2.0, 0.0] if isinstance(space, spaces.Box) else [1, 1]
+    model.policy.remember(obs, {"b": 1}, own_actions=np.array(fits))
+    expected = [0, 1, 0, 1, 0, 0] if isinstance(space, spaces.MultiDiscrete) else [*fits, 0]
+    assert valid_rows(model.policy.history).own[-1].tolist() == expected
+
+
+def test_copies_are_numbers_and_each_is_there_once():
+    policy, obs = adaptive().policy, observations_of(adaptive(), 2)
+    with pytest.raises(ValueError, match="copies must each be another one"):
+        policy.remember(obs, {"b": np.array([0, 1])}, copies=np.array([1, 1]))
+    policy.remember(obs, {"b": np.array([0, 1])}, copies=np.array([1, 0], dtype=np.uint8))
+    for wrong in ([-1], 0, [0.5], "all"):
+        with pytest.raises(ValueError, match="copies must be a list of integers"):
+            policy.end_episodes(wrong)
+    assert valid_rows(policy.history).stamps[:, 2].tolist() == [-1, -1]
+    policy.end_episodes([1])
+    assert valid_rows(policy.history).stamps[:, 1:].tolist() == [[DEPLOYED - 1, -2], [DEPLOYED, -1]]
+
+
+def test_own_actions_are_remembered_as_the_environment_got_them():
+    got = []
+
+    class Keeps(AmongOthers):
+        def step(self, action):
+            got.append(np.array(action))
+            return super().step(action)
+
+    env = make_vec_env(Keeps, n_envs=1, env_kwargs=dict(action_space=spaces.Box(0, 10, (2,), np.float32), visible=1.0))
+    model = BeliefPPO(
+        "BeliefPolicy", env, use_sde=True, **{**SMALL, **ADAPTIVE, "policy_kwargs": {"squash_output": True, "latent_dim": 4}}
+    )
+    model.learn(SMALL["n_steps"])
+    rows = valid_rows(model.policy.history)
+    np.testing.assert_allclose(rows.own[:, :2], np.array(got)[-len(rows.own) :], rtol=1e-5)
+
+
+def test_time_passes_in_rollouts_without_an_update():
+    model = adaptive(env_kwargs=dict(inactive=1))
+    for clock in (1, 2):
+        model.learn(ROLLOUT, reset_num_timesteps=False)
+        assert model.policy.features_extractor.clock == clock * SMALL["n_steps"]
+
+    class Stops(BaseCallback):
+        def _on_step(self):
+            return self.n_calls < 5
+
+    model.learn(ROLLOUT, callback=Stops(), reset_num_timesteps=False)
+    # Of the rollout that was stopped four steps are in the buffer
+    assert model.policy.features_extractor.clock == 2 * SMALL["n_steps"] + 4
+
+
+def test_nothing_else_is_remembered_in_a_rollout_of_the_training():
+    """The update would attend to other rows than acting did."""
+    model = adaptive()
+
+    class Remembers(BaseCallback):
+        def _on_step(self):
+            model.policy.remember(observations_of(model, 1), {"b": 1})
+            return True
+
+    with pytest.raises(ValueError, match="in a rollout of its training"):
+        model.learn(ROLLOUT, callback=Remembers())
+    model.policy.remember(observations_of(model, 1), {"b": 1})
+    assert len(valid_rows(model.policy.history).valid) == 1
 
 
 @pytest.mark.parametrize("ends", [False, True])

@@ -127,6 +127,29 @@ def test_histories_hold_what_a_training_would_remember(make):
             assert th.equal(history.actions, trained[agent].actions)
 
 
+@pytest.mark.parametrize("make", [BlinkingEnv, ScriptedEnv])
+def test_time_passes_as_in_a_training(make):
+    """Also in steps in which an agent is in play in no copy, so that the age of what it has seen means the same."""
+    team = Team(BeliefPPO, "BeliefPolicy", make_team_env(make, n_envs=1, seed=0), seed=0, **{**BELIEF, "belief": "adaptive"})
+    with observing(team, team.env) as watched:
+        watched.reset()
+        for k in range(12):
+            watched.is_open = k < 10
+            watched.step({agent: np.zeros((1, *space.shape), space.dtype) for agent, space in team.env.action_space.items()})
+        clocks = {agent: model.policy.features_extractor.clock for agent, model in team.agents.items()}
+        assert clocks == dict.fromkeys(team.agents, 10)
+
+
+def test_nobody_learns_while_observing():
+    env = make_team_env(ToyEnv, n_envs=2, seed=0)
+    team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, **BELIEF)
+    with observing(team, make_team_env(ToyEnv, n_envs=2, seed=1)) as watched:
+        watched.reset()
+        with pytest.raises(ValueError, match="learn\\(\\) within observing"):
+            team.learn(64)
+    team.learn(64)
+
+
 def test_normalised_agents_remember_what_they_see():
     env = make_team_env(ToyEnv, n_envs=2, seed=0)
     team = Team(BeliefPPO, "BeliefPolicy", env, seed=0, normalize=True, **BELIEF).learn(64)
