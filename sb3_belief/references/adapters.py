@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from sb3_belief.common.action_masks import mask_width
 from sb3_belief.references.one_learner import OneLearnerVecEnv
 from sb3_belief.references.with_state import WithAgentId, WithState, one_row
+from sb3_belief.team.normalization import AgentNormalize
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.vec_env.observation_forms import map_parts, row_of
 from sb3_belief.vec_env.team_vec_env import TeamObs, TeamVecEnv
@@ -147,7 +148,8 @@ class SharedVecEnv(VecEnvWrapper):
     Shows each agent of each copy as a row of its own, ``n * n_envs`` of them: agent i of copy e is the row ``e * n + i``.
 
     A row has the agent's own observation, reward and done, and in its info ``active``, as the agent's own environment in a
-    ``Team`` has them. So a model that learns here acts for all agents with the same weights.
+    ``Team`` has them. So a model that learns here acts for all agents with the same weights. In a ``Team`` that normalises
+    observations, it is one statistic for all agents as well.
 
     :param venv: Shows the agents' observations stacked: :class:`StackedVecEnv`, or what a team hands to its one learner
     :raises ValueError: If it shows something else, or normalises rewards, which are the team's there
@@ -170,6 +172,8 @@ class SharedVecEnv(VecEnvWrapper):
         #: How many agents there are
         self.n_agents = int(shape[0])
         self._statistics = unwrap_vec_normalize(venv)
+        if isinstance(self._statistics, AgentNormalize):
+            self._statistics.share_places()
         super().__init__(venv, row_space(venv.observation_space), row_space(venv.action_space))
         self.num_envs = venv.num_envs * self.n_agents
 

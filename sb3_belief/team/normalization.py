@@ -4,6 +4,7 @@ import copyreg
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
@@ -37,6 +38,45 @@ class AgentNormalize(VecNormalize):
         # loader allows
         return copyreg._reconstructor, (VecNormalize, object, None), state  # type: ignore[attr-defined]
 
+    def share_places(self) -> None:
+        """
+        Have the agents whose observations are stacked, ``[n, ...]``, share one statistic, as they share weights.
+
+        With one for each place whatever tells agents apart, such as a one-hot id, would be normalised to zero. Statistics that
+        have seen something stay as they are.
+        """
+        if not self.norm_obs:
+            return
+        if isinstance(self.obs_rms, dict):
+            self.obs_rms = {key: _of_one_place(statistics) for key, statistics in self.obs_rms.items()}
+        else:
+            self.obs_rms = _of_one_place(self.obs_rms)
+
+    @property
+    def _has_shared_places(self) -> bool:
+        if not self.norm_obs:
+            return False
+        if isinstance(self.obs_rms, dict):
+            spaces_of: Any = self.observation_space
+            return any(rms.mean.shape != spaces_of[key].shape for key, rms in self.obs_rms.items())
+        return self.obs_rms.mean.shape != self.observation_space.shape
+
+    def reset(self) -> Any:
+        """
+        Reset, and normalise as ``VecNormalize`` does.
+
+        :return: Observations of the agent
+        """
+        if not (self.training and self._has_shared_places):
+            return super().reset()
+        self.training = False
+        try:
+            super().reset()
+        finally:
+            self.training = True
+        self._update_observations(self.old_obs)
+        return self.normalize_obs(self.old_obs)
+
     def step_wait(self) -> VecEnvStepReturn:
         """
         Step, and normalise as ``VecNormalize`` does.
@@ -48,7 +88,7 @@ class AgentNormalize(VecNormalize):
         active = np.array([info["active"] for info in infos])
         seen = active & (~dones | _any_nonzero(obs, dones)) | np.array(["episode" in info for info in infos])
         venv, training = self.venv, self.training
-        if training and not (active.all() and seen.all()):
+        if training and (not (active.all() and seen.all()) or self._has_shared_places):
             self._update(obs, rewards, seen, active)
             self.training = False
         # SB3's own method does the rest with the step that has been taken
@@ -61,15 +101,23 @@ class AgentNormalize(VecNormalize):
     def _update(self, obs: Any, rewards: np.ndarray, seen: np.ndarray, active: np.ndarray) -> None:
         """Update the statistics by the rows that count, as ``VecNormalize`` does by all."""
         if self.norm_obs and seen.any():
-            if isinstance(self.obs_rms, dict):
-                for key, statistics in self.obs_rms.items():
-                    statistics.update(obs[key][seen])
-            else:
-                self.obs_rms.update(obs[seen])
+            self._update_observations({key: part[seen] for key, part in obs.items()} if isinstance(obs, dict) else obs[seen])
         # What comes after an agent's death may still count for what it did before: its return goes on
         self.returns = self.returns * self.gamma + rewards
         if active.any():
             self.ret_rms.update(self.returns[active])
+
+    def _update_observations(self, obs: Any) -> None:
+        if isinstance(self.obs_rms, dict):
+            for key, statistics in self.obs_rms.items():
+                statistics.update(obs[key].reshape(-1, *statistics.mean.shape))
+        else:
+            self.obs_rms.update(obs.reshape(-1, *self.obs_rms.mean.shape))
+
+
+def _of_one_place(statistics: RunningMeanStd) -> RunningMeanStd:
+    # Their count is a small number before the first observation
+    return statistics if statistics.count >= 1 else RunningMeanStd(statistics.count, statistics.mean.shape[1:])
 
 
 class _Taken:

@@ -151,7 +151,8 @@ def test_own_actions_are_remembered_as_the_environment_got_them():
         "BeliefPolicy", env, use_sde=True, **{**SMALL, **ADAPTIVE, "policy_kwargs": {"squash_output": True, "latent_dim": 4}}
     )
     model.learn(SMALL["n_steps"])
-    rows = valid_rows(model.policy.history)
+    history: Any = model.policy.history
+    rows = valid_rows(history)
     np.testing.assert_allclose(rows.own[:, :2], np.array(got)[-len(rows.own) :], rtol=1e-5)
 
 

@@ -12,8 +12,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.cli.main import main
-from sb3_belief.references.adapters import SharedVecEnv, StackedVecEnv, row_space, shared_weights, stacked_space
-from sb3_belief.references.shared import MaskableSharedPPO, SharedPPO
+from sb3_belief.references.adapters import (
+    SharedVecEnv,
+    StackedVecEnv,
+    row_space,
+    shared_weights,
+    shared_with_state,
+    stacked_space,
+)
+from sb3_belief.references.shared import MaskableSharedPPO, SharedMAPPO, SharedPPO
 from sb3_belief.references.with_state import WithAgentId
 from sb3_belief.vec_env.agent_vec_env import TransitionSplitter
 from sb3_belief.zoo.config import load_config
@@ -173,6 +180,33 @@ def test_normalised_last_observations_are_those_of_the_statistics():
     expected: Any = normalized.normalize_obs(own)
     np.testing.assert_allclose(last, expected, rtol=1e-6)
     assert not np.allclose(last, own)
+
+
+@pytest.mark.parametrize("adapter", [shared_weights, shared_with_state])
+def test_normalised_agents_are_told_apart_and_alike_otherwise(adapter):
+    """A statistic for each place would make zeros of whatever tells them apart."""
+    env = adapter(make_team_env("permutation", n_envs=4, seed=0))
+    algorithm, policy = (SharedPPO, "MlpPolicy") if adapter is shared_weights else (SharedMAPPO, "MultiInputPolicy")
+    team = Team(algorithm, policy, env, seed=0, normalize={"norm_reward": False}, **PPO_KWARGS).learn(64)
+    statistics: Any = team.agents["team"].get_vec_normalize_env()
+    seen = statistics.normalize_obs(env.reset()["team"])
+    for part in seen.values() if isinstance(seen, dict) else [seen]:
+        assert part.shape[:2] == (4, 2) and np.isfinite(part).all()
+    ids = seen["critic_id"] if isinstance(seen, dict) else seen[..., -2:]
+    np.testing.assert_allclose(ids, np.tile([[1, -1], [-1, 1]], (4, 1, 1)), atol=0.05)
+    # Statistics of all rows: 64 joint steps of two agents, and the first observations
+    found = statistics.obs_rms["critic_id"] if isinstance(seen, dict) else statistics.obs_rms
+    assert found.mean[-2:].tolist() == pytest.approx([0.5, 0.5], abs=1e-3) and found.mean.ndim == 1
+    assert found.count == pytest.approx(2 * (64 + 4), abs=0.01)
+    # As they are saved
+    file = io.BytesIO()
+    team.save(file)
+    file.seek(0)
+    loaded = Team.load(file, env=env)
+    again = loaded.agents["team"].get_vec_normalize_env().normalize_obs(env.reset()["team"])
+    for mine, theirs in zip(*(each.values() if isinstance(each, dict) else [each] for each in (seen, again)), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    loaded.learn(64)
 
 
 def test_normalised_rewards_are_refused():
