@@ -40,8 +40,17 @@ def test_a_dry_run_of_each(name, tmp_path, capsys):
         # Never for another reason than an environment that is not here, and then all others have been checked
         assert status == 2 and "which is not installed" in captured.err
         assert captured.err.endswith("All that does not need it has been checked.\n")
-        assert name in ("comparison", "lbf", "smac_paper", "smax", "speaker_listener")
+        assert name in ("comparison", "comparison_smax", "lbf", "smac_paper", "smax", "speaker_listener")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_comparison_set_is_compared_everywhere():
+    """What is not everywhere has no overall score, and without its baseline nothing is compared."""
+    for name in ("comparison", "comparison_smax"):
+        study = load_study(FOLDER / f"{name}.yml")
+        assert study.baseline == "ippo" and set(study.pairs()) == {(arm, env_id) for arm in study.arms for env_id in study.places}
+    games, smax = (set(load_study(FOLDER / f"{name}.yml").arms) for name in ("comparison", "comparison_smax"))
+    assert games == smax
 
 
 def test_the_paper_is_compared_as_it_says():
