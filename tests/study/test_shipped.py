@@ -48,7 +48,8 @@ def test_the_comparison_set_is_compared_everywhere():
     """What is not everywhere has no overall score, and without its baseline nothing is compared."""
     for name in ("comparison", "comparison_smax"):
         study = load_study(FOLDER / f"{name}.yml")
-        assert study.baseline == "ippo" and set(study.pairs()) == {(arm, env_id) for arm in study.arms for env_id in study.places}
+        assert study.baseline == "ippo"
+        assert set(study.pairs()) == {(arm, env_id) for arm in study.arms for env_id in study.places}
     games, smax = (set(load_study(FOLDER / f"{name}.yml").arms) for name in ("comparison", "comparison_smax"))
     assert games == smax
 
