@@ -107,12 +107,21 @@ def _encoded(name: str, space: spaces.Space, actions: Any, seen: np.ndarray) -> 
         )
     rows = np.zeros((int(seen.sum()), spaces.flatdim(space)), dtype=np.float32)
     for row, value in zip(rows, values[seen], strict=True):
-        # Bounds of numbers are not checked: others may act beyond them, which their environment clips
-        fits = np.isfinite(value).all() if isinstance(space, spaces.Box) else space.contains(value)
-        if not fits:
+        if not is_action_of(space, value):
             raise ValueError(f"{value!r} is no action of {name!r}, whose space is {space}")
         row[:] = np.asarray(spaces.flatten(space, value))
     return rows
+
+
+def is_action_of(space: spaces.Space, value: Any) -> bool:
+    """
+    Return whether a value can have been somebody's action. Bounds of numbers do not count: one may act beyond them, which an
+    environment clips.
+
+    :param space: The action space
+    :param value: The action
+    """
+    return bool(np.isfinite(value).all()) if isinstance(space, spaces.Box) else space.contains(value)
 
 
 def others_of(env: VecEnv) -> ActionSpaces:

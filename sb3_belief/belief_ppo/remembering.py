@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -13,7 +12,7 @@ from sb3_belief.belief import DynamicBelief, History
 from sb3_belief.belief_ppo.adaptive import AdaptiveExtractor
 from sb3_belief.belief_ppo.extractor import BeliefExtractor, flat_observations
 from sb3_belief.belief_ppo.networks import BeliefNetworksMixin
-from sb3_belief.belief_ppo.others import others_rows
+from sb3_belief.belief_ppo.others import is_action_of, others_rows
 from sb3_belief.common.action_encoding import RowEncoder
 
 # Of how many observations the features are computed at a time
@@ -152,16 +151,11 @@ class RememberingMixin(BeliefNetworksMixin):
             elif acted is None:
                 own[:, columns] = encoder(values)
             else:
-                self._check_actions(values[acted])
+                for action in values[acted]:
+                    if not is_action_of(self.action_space, action):
+                        raise ValueError(f"own_actions has {action!r}, which is no action of {self.action_space}")
                 own[acted, columns] = encoder(values[acted])
         return own
-
-    def _check_actions(self, actions: np.ndarray) -> None:
-        # Numbers may lie beyond their bounds, to which the environment clips them
-        if not isinstance(self.action_space, spaces.Box):
-            for action in actions:
-                if not self.action_space.contains(action):
-                    raise ValueError(f"own_actions has {action!r}, which is no action of {self.action_space}")
 
     def end_episodes(self, copies: np.ndarray | None = None) -> None:
         """
