@@ -25,8 +25,8 @@ if sys.platform != "win32":
 
 #: Seconds that a worker gets to finish what it is at before it is killed, and how many times what it took at most so far
 PATIENCE, PATIENCE_FACTOR = 2.0, 3.0
-# The second is what torch imports when the first optimizer is made
-_WORKERS_NEED = ["sb3_belief.team", "torch._dynamo"]
+#: What worker processes import, the second because torch does when the first optimizer is made
+WORKERS_NEED = ["sb3_belief.team", "torch._dynamo"]
 # Signals that ask a process to end. The main process decides what they mean for its workers
 _END_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _ASKING = [int(number) for number in (signal.SIGINT, *_END_SIGNALS)]
@@ -79,7 +79,7 @@ def _preload() -> None:
     if sys.platform == "win32":
         return
     modules = getattr(forkserver._forkserver, "_preload_modules", ["__main__"])
-    multiprocessing.set_forkserver_preload([*modules, *(name for name in _WORKERS_NEED if name not in modules)])
+    multiprocessing.set_forkserver_preload([*modules, *(name for name in WORKERS_NEED if name not in modules)])
 
 
 def start_worker(target: Callable[..., None], args: tuple[Any, ...], name: str | None = None) -> Any:

@@ -16,15 +16,10 @@ import signal
 import sys
 from multiprocessing import forkserver
 
-#: What workers need
-WORKERS_NEED = [
-    "torch._dynamo",
-    "sb3_belief.team",
-    "sb3_belief.belief_ppo",
-    "sb3_contrib",
-    "mpe2.simple_spread_v3",
-    "lbforaging",
-]
+from sb3_belief.common.processes import WORKERS_NEED
+
+#: What workers need beside what all do
+MORE = ["sb3_belief.belief_ppo", "sb3_contrib", "mpe2.simple_spread_v3", "lbforaging"]
 
 
 def _import_all() -> None:
@@ -82,7 +77,7 @@ def _start(words: list[str], output: str, limit: int | None = None) -> int:
 
 def main() -> None:
     """Answer commands until the standard input ends."""
-    multiprocessing.set_forkserver_preload([*WORKERS_NEED, *sys.argv[1:]])
+    multiprocessing.set_forkserver_preload([*WORKERS_NEED, *MORE, *sys.argv[1:]])
     forkserver.ensure_running()
     _import_all()
     gc.freeze()
