@@ -15,9 +15,12 @@ from stable_baselines3.dqn.dqn import DQN
 from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
 from sb3_belief.baselines.q_networks import MaskedQCnnPolicy, MaskedQMultiInputPolicy, MaskedQPolicy
 from sb3_belief.common.action_masks import env_masks
+from sb3_belief.common.checks import check_integer
 from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 SelfIQL = TypeVar("SelfIQL", bound="IQL")
+# SB3's default
+_EXPLORATION_FRACTION = 0.1
 
 
 class IQL(SafeFilesMixin, DQN):
@@ -55,6 +58,8 @@ class IQL(SafeFilesMixin, DQN):
     :param exploration_final_eps: Epsilon in the end
     :param max_grad_norm: Largest norm of the gradient
     :param double_q: Whether the online network chooses the action of the target
+    :param exploration_steps: Steps of all copies in which epsilon falls, at least 1, however long the training is, as in the
+        references whose training is centralised; None for a share of the training, ``exploration_fraction``
     :param replay_buffer_kwargs: Further arguments of the replay buffer
     :param stats_window_size: Number of episodes over which logged returns are averaged
     :param tensorboard_log: Folder of the TensorBoard log; None for none
@@ -63,6 +68,7 @@ class IQL(SafeFilesMixin, DQN):
     :param seed: Seed of the random numbers
     :param device: Device of the networks
     :param _init_setup_model: Whether to build the networks, internal to SB3
+    :raises ValueError: If ``exploration_steps`` is not a positive integer, or given beside an ``exploration_fraction``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -86,11 +92,12 @@ class IQL(SafeFilesMixin, DQN):
         train_freq: int | tuple[int, str] = 8,
         gradient_steps: int = 1,
         target_update_interval: int = 10_000,
-        exploration_fraction: float = 0.1,
+        exploration_fraction: float = _EXPLORATION_FRACTION,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
         max_grad_norm: float = 10,
         double_q: bool = True,
+        exploration_steps: int | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -100,7 +107,14 @@ class IQL(SafeFilesMixin, DQN):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        self.double_q = double_q
+        if exploration_steps is not None:
+            check_integer("exploration_steps", exploration_steps, 1, "the steps in which epsilon falls")
+            if exploration_fraction != _EXPLORATION_FRACTION:
+                raise ValueError(
+                    f"exploration_fraction={exploration_fraction} and exploration_steps={exploration_steps} both say how long"
+                    " epsilon falls; leave one of them out, or give exploration_steps=None."
+                )
+        self.double_q, self.exploration_steps = double_q, exploration_steps
         #: Whether the environment has given masks, without which the agent then acts otherwise than in training
         self.learned_with_masks = False
         # Where the agent's own return runs: since the first step of a life in which it was in play, bool [n_envs]
@@ -213,7 +227,11 @@ class IQL(SafeFilesMixin, DQN):
         if reset_num_timesteps or self._last_obs is None or len(self._return_runs) != self.n_envs:
             # SB3 resets the environment
             self._return_runs = np.zeros(self.n_envs, dtype=bool)
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.exploration_steps is not None:
+            # As a share of all steps, which are known here only
+            self.exploration_schedule.end_fraction = self.exploration_steps / self._total_timesteps
+        return result
 
     def _store_transition(
         self,

@@ -47,8 +47,8 @@ _COUNT, _NOT_NEGATIVE, _POSITIVE, _FRACTION = Limits(1), Limits(0), Limits(0, op
 
 _NAMES: Mapping[Limits, str] = {
     _COUNT: "n_envs n_timesteps n_steps n_epochs batch_size buffer_size stats_window_size train_freq target_update_interval"
-    " policy_delay cg_max_steps line_search_max_iter n_critic_updates sub_sampling_factor n_quantiles n_critics"
-    " lstm_hidden_size n_lstm_layers net_arch embedding_dim latent_dim features_dim cnn_output_dim"
+    " policy_delay exploration_steps cg_max_steps line_search_max_iter n_critic_updates sub_sampling_factor n_quantiles"
+    " n_critics lstm_hidden_size n_lstm_layers net_arch embedding_dim latent_dim features_dim cnn_output_dim"
     " save_freq eval_freq check_freq log_freq n_eval_episodes max_episodes",
     _NOT_NEGATIVE: "learning_rate learning_starts vf_coef target_policy_noise target_noise_clip cg_damping action_coef kl_coef"
     " top_quantiles_to_drop_per_net min_evals max_no_improvement_evals",

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.evaluation import evaluate_policy
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
 from sb3_belief.baselines import IQL
@@ -185,6 +186,38 @@ def test_a_coin_for_each_copy():
     shares = [(model.predict(obs)[0] != greedy).mean() for _ in range(5)]
     assert shares == pytest.approx([0.2] * 5, abs=0.05)
     assert (model.predict(obs, deterministic=True)[0] == greedy).all()
+
+
+@pytest.mark.parametrize("total", [120, 240])
+def test_epsilon_falls_in_as_many_steps_however_long_the_training_is(total):
+    rates = {}
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            rates[self.num_timesteps] = self.model.exploration_rate
+            return True
+
+    kwargs = {**Q_KWARGS, "exploration_fraction": 0.1, "exploration_steps": 100}
+    eps = {"exploration_initial_eps": 0.8, "exploration_final_eps": 0.2}
+    team = Team(IQL, "MlpPolicy", make_team_env(ToyEnv, n_envs=2, seed=0), seed=0, **kwargs, **eps)
+    team.learn(60, agent_callbacks={"agent_0": Watch()})
+    team.learn(total - 60, agent_callbacks={"agent_0": Watch()}, reset_num_timesteps=False)
+    # The rate with which a step is made is that of the steps before it
+    expected = {step: max(0.2, 0.8 - 0.6 * (step - 2) / 100) for step in range(4, total + 1, 2)}
+    assert {step: rate for step, rate in rates.items() if step > 2} == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"exploration_steps": 0}, "exploration_steps=0 must be an integer >= 1"),
+        ({"exploration_steps": 1e4}, "exploration_steps=10000.0 must be an integer"),
+        ({"exploration_steps": 10, "exploration_fraction": 0.2}, "leave one of them out"),
+    ],
+)
+def test_wrong_lengths_of_exploration(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        IQL("MlpPolicy", gym.make("CartPole-v1"), **kwargs)
 
 
 # Ends, and steps out of play

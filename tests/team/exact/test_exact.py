@@ -83,7 +83,7 @@ CASES: dict[str, tuple[Any, str, Any, dict[str, Any]]] = {
     "maskable": (MaskablePPO, "MlpPolicy", EASY, PPO_KWARGS),
     "recurrent": (RecurrentPPO, "MlpLstmPolicy", ToyEnv, {**PPO_KWARGS, "normalize": True}),
     "dqn": (DQN, "MlpPolicy", ToyEnv, {**OFF, "target_update_interval": 30, "normalize": True, "exploration_fraction": 0.9}),
-    "iql": (IQL, "MlpPolicy", EASY, {**OFF, "exploration_fraction": 0.9}),
+    "iql": (IQL, "MlpPolicy", EASY, {**OFF, "exploration_steps": 60}),
     "dpiqn": (DPIQN, "MlpPolicy", EASY, OFF),
     "qrdqn": (QRDQN, "MlpPolicy", ToyEnv, OFF),
     "sac": (SAC, "MlpPolicy", pushes, {**OFF, "use_sde": True}),
