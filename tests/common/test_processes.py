@@ -38,7 +38,7 @@ def test_a_worker_ends_with_its_parent(way, method, tmp_path):
             multiprocessing.get_context("{method}").Process(target=work, daemon=True).start()
             time.sleep(1000)
     """
-    process = run_script(script, tmp_path, marker)
+    process = run_script(script, tmp_path, marker, head="")
     assert process.stdout is not None
     try:
         assert process.stdout.readline() == "ready\n"
@@ -194,7 +194,7 @@ def test_a_process_of_multiprocessing_ends_with_workers_that_it_still_holds(meth
             print(process.exitcode, flush=True)
             process.kill()
     """
-    process = run_script(script, tmp_path, marker)
+    process = run_script(script, tmp_path, marker, head="")
     assert process.communicate(timeout=120)[0] == "0\n"
     assert process.returncode == 0
     assert not gone_within(30, marker)

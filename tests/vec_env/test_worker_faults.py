@@ -10,6 +10,7 @@ import uuid
 from functools import partial
 from multiprocessing import Pipe
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import pytest
@@ -316,17 +317,26 @@ def test_step_timeout_needs_workers():
 # Whole processes
 
 
-def run_script(body, tmp_path, marker=""):
-    """Run a script, which can use what is imported here."""
-    lines = body.split("\n")
-    indent = min((len(line) - len(line.lstrip()) for line in lines if line.strip()), default=0)
-    head = "import os, sys, time, signal\nfrom functools import partial\nfrom sb3_belief.team import make_team_env, Team\n"
-    head += (
-        "import multiprocessing; multiprocessing.set_forkserver_preload(['tests.vec_env.faulty_envs', 'sb3_belief.team'])\n"
-    )
-    head += "from tests.team.toy_envs import ToyEnv\nfrom tests.vec_env.faulty_envs import *\n"
+#: What a script with an environment in workers begins with
+WITH_WORKERS = """
+import multiprocessing
+from functools import partial
+from sb3_belief.team import make_team_env, Team
+from tests.team.toy_envs import ToyEnv
+from tests.vec_env.faulty_envs import *
+multiprocessing.set_forkserver_preload(["tests.vec_env.faulty_envs", "sb3_belief.team"])
+"""
+#: The same if nobody learns in a worker: they need not import what optimizers do
+WITH_COPIES = f"""{WITH_WORKERS}
+from sb3_belief.common import processes
+processes.WORKERS_NEED.remove("torch._dynamo")
+"""
+
+
+def run_script(body, tmp_path, marker="", head=WITH_COPIES):
+    """Run a script that begins with some imports."""
     path = tmp_path / "script.py"
-    path.write_text(head + "\n".join(line[indent:] for line in lines))
+    path.write_text(f"import os, sys, time, signal\n{head}\n{dedent(body)}")
     root = str(Path(__file__).parents[2])
     env = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1", "FAULTS_TEST": marker}
     return subprocess.Popen([sys.executable, str(path)], stdout=subprocess.PIPE, text=True, env=env)

@@ -19,6 +19,7 @@ from tests.team.parallel.test_jobs import no_processes_stay, notes, toy_team
 from tests.team.toy_envs import ToyEnv
 from tests.vec_env.test_worker_faults import (  # noqa: F401 (one is a fixture)
     LINUX,
+    WITH_WORKERS,
     gone_within,
     marked,
     no_test_hangs,
@@ -180,7 +181,7 @@ def test_no_process_stays_after_kill_9(case, tmp_path):
             print("ready", flush=True)
             team.learn(10**9)
     """
-    process = run_script(script, tmp_path, marker)
+    process = run_script(script, tmp_path, marker, head=WITH_WORKERS)
     assert process.stdout is not None
     try:
         assert process.stdout.readline() == "ready\n"
