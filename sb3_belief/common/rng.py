@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from numpy.random import mtrand
 
 
@@ -90,6 +91,21 @@ class RngState:
         :param other: State to take over
         """
         self._torch, self._numpy = other._torch, other._numpy
+
+
+@contextmanager
+def sampling_from(space: spaces.Space, generator: np.random.Generator) -> Iterator[None]:
+    """
+    Have a space draw its samples from another generator within the block.
+
+    :param space: The space, none of Dict or Tuple, whose parts have generators of their own
+    :param generator: What it draws from
+    """
+    own, space._np_random = space._np_random, generator
+    try:
+        yield
+    finally:
+        space._np_random = own
 
 
 # Held by the thread in which a team's generators are the global ones

@@ -5,6 +5,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
+from contextlib import nullcontext
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
-from sb3_belief.common.rng import RngState, RngSwitch
+from sb3_belief.common.rng import RngState, RngSwitch, sampling_from
 from sb3_belief.common.safe_files.archive import names_in
 from sb3_belief.common.safe_files.models import class_of, plain_objects
 from sb3_belief.common.safe_files.trust import PICKLE, UNTRUSTED, Trust
@@ -143,7 +144,10 @@ class Partner:
         self, obs: Any, state: PolicyState, starts: np.ndarray, masks: np.ndarray | None
     ) -> tuple[np.ndarray, PolicyState]:
         assert self._predictor is not None
-        result = self._predictor.predict(obs, state, starts, self.deterministic, masks)
+        # DQN and those like it explore by samples of their action space, which has a generator of its own
+        space = getattr(self._predictor.model, "action_space", None)
+        with sampling_from(space, self.rng.generator()) if isinstance(space, spaces.Space) else nullcontext():
+            result = self._predictor.predict(obs, state, starts, self.deterministic, masks)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(
                 f"predict() of the partner {self._name!r} returned {result!r}; as SB3's it must return (action, state)."

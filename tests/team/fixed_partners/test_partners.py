@@ -14,9 +14,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
+from sb3_belief.baselines import IQL
 from sb3_belief.belief_ppo import BeliefPPO, MaskableBeliefPPO
 from tests.archives import members_of
-from tests.team.fixed_partners.helpers import AgentEnv, one, toy, zero
+from tests.team.fixed_partners.helpers import AgentEnv, one, save_exploring_team, toy, zero
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import MaskedEnv, PartneredEnv, ToyEnv
 
@@ -218,8 +219,12 @@ def test_the_learner_does_not_depend_on_its_partners_random_numbers():
     assert all((result == results[0]).all() for result in results)
 
 
-def test_seeded_partners_sample_the_same_again(tmp_path):
-    trained(tmp_path / "team.zip")
+@pytest.mark.parametrize("algo", [PPO, DQN, IQL])
+def test_seeded_partners_sample_the_same_again(algo, tmp_path):
+    if algo is PPO:
+        trained(tmp_path / "team.zip")
+    else:
+        save_exploring_team(tmp_path / "team.zip", algo, n_agents=2)
     env = AgentEnv(toy(2), "agent_0", tmp_path / "team.zip")
     first, second, other = (others_did(env, seed=seed) for seed in (4, 4, 5))
     assert np.array_equal(first, second) and not np.array_equal(first, other)

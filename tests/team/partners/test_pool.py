@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 
+from sb3_belief.baselines import IQL
 from sb3_belief.common.redraws import RedrawSchedule
 from sb3_belief.team import PartnerPool, PartnersVecEnv
 from sb3_belief.vec_env.observe_last import ObserveLastVecEnv
-from tests.team.fixed_partners.helpers import one, toy, zero
+from tests.team.fixed_partners.helpers import one, save_exploring_team, toy, zero
 from tests.team.helpers import PPO_KWARGS, Record, Team, make_team_env, parameters
 from tests.team.partners.helpers import ZERO_ONE, noisy, partnered, play, pool_of, saved_team
 
@@ -209,12 +210,13 @@ def test_the_log_has_the_returns_beside_each_partner(tmp_path):
 
 
 def make_resumable(tmp_path, env):
-    """Return a team beside a pool of a recurrent, a sampling and a scripted partner, and another pool by rollouts."""
+    """Return a team beside a pool of recurrent, sampling, exploring and scripted partners, and another pool by rollouts."""
     recurrent = saved_team(
         tmp_path / "r.zip", RecurrentPPO, "MlpLstmPolicy", policy_kwargs={"lstm_hidden_size": 4}, n_agents=3
     )
     sampling = saved_team(tmp_path / "s.zip", PPO, n_agents=3)
-    members = {"recurrent": recurrent, "sampling": sampling, "noisy": noisy}
+    exploring = {algo.__name__: save_exploring_team(tmp_path / f"{algo.__name__}.zip", algo, 3) for algo in (DQN, IQL)}
+    members = {"recurrent": recurrent, "sampling": sampling, "noisy": noisy, **exploring}
     partners = {
         "agent_1": PartnerPool(members, redraw_every=2),
         "agent_2": PartnerPool(members, 1, "rollouts", per_copy=False, seed=3),
