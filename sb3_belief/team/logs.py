@@ -30,6 +30,14 @@ def _has_spread(key: str) -> bool:
     return key in ("rollout/ep_rew_mean", "train/approx_kl") or key.startswith("belief/")
 
 
+class _WholeKeys(HumanOutputFormat):
+    """SB3's table, in which keys are never cut: SB3 raises an error where two are equal then, as paths of partners may be."""
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        self.max_length = max([36, *map(len, key_values)])
+        super().write(key_values, key_excluded, step)
+
+
 class _LatestValues(KVWriter):
     """
     Writer that passes the values of an agent's logger to the team's log, which keeps the latest of each key.
@@ -142,8 +150,7 @@ class TeamLog:
         self._used = dict(self.agent_loggers)
         self._iterations: dict[str, _Iterations] = {}
         if verbose >= 1:
-            # Longer keys than SB3's own: it refuses two that are equal when they are cut
-            self.team_logger.output_formats.append(HumanOutputFormat(sys.stdout, max_length=100))
+            self.team_logger.output_formats.append(_WholeKeys(sys.stdout))
 
     def connect(self, agent: str, model: BaseAlgorithm) -> None:
         """

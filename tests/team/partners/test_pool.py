@@ -209,6 +209,15 @@ def test_the_log_has_the_returns_beside_each_partner(tmp_path):
     assert sum(key.startswith("partners/") for key in recorded) == 20
 
 
+def test_names_may_be_as_long_as_paths(capsys):
+    names = [f"/{'folder/' * 20}seed_{seed}/ppo/{'environment' * 3}_1/team.zip" for seed in (10, 11)]
+    pool = PartnerPool(dict(zip(names, (zero, one), strict=True)))
+    env = make_team_env(toy(2), n_envs=4)
+    Team(PPO, "MlpPolicy", env, seed=0, partners={"agent_1": pool}, verbose=1, **PPO_KWARGS).learn(4 * 32)
+    table = capsys.readouterr().out
+    assert all(f"{name}/ep_rew_mean" in table for name in names)
+
+
 def make_resumable(tmp_path, env):
     """Return a team beside a pool of recurrent, sampling, exploring and scripted partners, and another pool by rollouts."""
     recurrent = saved_team(
