@@ -27,12 +27,13 @@ from sb3_belief.zoo.train import make_env, make_team
 from sb3_belief.zoo.train_options import TrainOptions
 from sb3_belief.zoo.yaml_data import read_file
 
-# In place of an environment that is not installed: one of vectors and masks. No configuration file has a section for it
-_STAND_IN = "sb3_belief.envs.traffic_junction.parallel_env:TrafficJunction"
-# Settings that only the environment itself can check
-_OF_ENV = ("env_kwargs", "eval_env_kwargs", "env_wrapper", "observe_last", "observe_window", "memory_span", "agent_kwargs")
+# In place of an environment that is not installed. No configuration file has a section for it
+_STAND_IN = "sb3_belief.study.stand_in:StandIn"
+# Settings of which an environment is made, and those that only it can check
+_MADE_OF = ("env_kwargs", "env_wrapper", "observe_last", "observe_window", "memory_span", "partners")
+_OF_ENV = (*_MADE_OF, "eval_env_kwargs", "agent_kwargs")
 # Settings of which a team's environment is made
-_OBSERVED = ("env_kwargs", "env_wrapper", "visibility", "observe_last", "observe_window", "memory_span", "adapter_kwargs")
+_OBSERVED = (*_MADE_OF, "visibility", "adapter_kwargs")
 # A team of agents with rollouts of one step needs two copies
 _COPIES = 2
 

@@ -1,6 +1,7 @@
 """What the file of a study says, and what is refused with file and line."""
 
 import re
+from contextlib import nullcontext
 
 import pytest
 import yaml
@@ -190,3 +191,24 @@ def test_an_argument_for_the_seed_that_does_not_fit(tmp_path, name, message):
     with pytest.raises(ConfigError, match=message):
         check_study(read(tmp_path, SEEDED.replace("partner_seed", name)), tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
+
+
+BESIDE = {"learners": ["car_0"], "members": {"waits": "tests.study.tiny:waits"}}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        # Whoever stands beside an arm without partners, or one with others, has an environment of its own
+        ({"algo": "ppo", "params": {"partners": {**BESIDE, "learners": ["car_99"]}}}, r"has no \['car_99'\]"),
+        ({"algo": "ppo", "params": {"partners": BESIDE, "agent_kwargs": {"car_1": {"n_steps": 8}}}}, "'car_1'"),
+        ({"algo": "ppo", "params": {"partners": BESIDE}}, None),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_arms_may_have_partners_of_their_own(tmp_path, settings, message, first):
+    others = {"plain": {"algo": "ppo", "params": {"agent_kwargs": {"car_1": {"n_steps": 8}}}}}
+    arms = {"beside": settings, **others} if first else {**others, "beside": settings}
+    path = write(tmp_path, environments={EASY: TINY["environments"][EASY]}, algorithms=arms)
+    with pytest.raises(ConfigError, match=message) if message else nullcontext():
+        check_study(load_study(path), tmp_path / "logs", ("tests",))

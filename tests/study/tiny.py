@@ -28,6 +28,11 @@ TINY: dict[str, Any] = {
 }
 
 
+def waits(obs):
+    """Wait, as a partner."""
+    return 1
+
+
 def write(folder, name="study.yml", **changes):
     """Write the file of the tiny study with some keys changed, and return its path."""
     path = Path(folder) / name
