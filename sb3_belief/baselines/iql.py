@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.dqn.dqn import DQN
 
 from sb3_belief.baselines.masked_replay import MaskedDictReplayBuffer, MaskedReplayBuffer, MaskedReplayMixin
@@ -230,7 +231,8 @@ class IQL(SafeFilesMixin, DQN):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self.exploration_steps is not None:
             # As a share of all steps, which are known here only
-            self.exploration_schedule.end_fraction = self.exploration_steps / self._total_timesteps
+            share = self.exploration_steps / self._total_timesteps
+            self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, share)
         return result
 
     def _store_transition(

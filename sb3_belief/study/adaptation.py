@@ -85,7 +85,7 @@ class _Contender:
         if role != TEAM and run_of(path) is not None:
             saved = replace(saved, env=None)
         # Those whom it has met in its training are not met here
-        shown = replace(environment_of(path, saved, flag), partners=None)
+        shown = environment_of(path, saved, flag, with_partners=False)
         try:
             agents = list(read_team(path, Trust.of(saved.trust, saved.extra_packages)).manifest["agents"])
         # A damaged file makes zipfile and json raise whatever they raise

@@ -4,15 +4,12 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from sb3_belief.report.adaptation import ALL
-from sb3_belief.study.run_reading import run_folders
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short
 from sb3_belief.zoo.partners import check_partners, partners_of_flag
-from sb3_belief.zoo.run_folder import RECORD
 from sb3_belief.zoo.yaml_data import parse
 
 # partner_seed:100..107, or partner_seed:3,5,9
@@ -57,14 +54,7 @@ def read_pool(given: str, extra_packages: tuple[str, ...] = ()) -> list[PoolEntr
             " environment's own partners an argument and its values, such as partner_seed:100..107."
         )
     location = Location("--partners", extra_packages)
-    if os.path.isdir(given) and not os.path.isfile(os.path.join(given, RECORD)):
-        folders = list(run_folders(Path(given)))
-        if not folders:
-            raise ConfigError(f"--partners: no run in {short(given)}: give the folder of a run, or one with runs.")
-        settings: dict[str, Any] = {"members": {path.relative_to(given).as_posix(): str(path) for path in folders}}
-    else:
-        settings = partners_of_flag(given)
-    checked = check_partners(settings, location) or {}
+    checked = check_partners(partners_of_flag(given), location) or {}
     members, held_out = checked.get("members", {}), checked.get("held_out", [])
     unknown = [name for name in held_out if name not in members]
     if unknown or not members:

@@ -9,10 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from sb3_belief.report.tuning_page.facts import SearchedSetting, TrialFacts, TuningFacts
-from sb3_belief.study.trials_table import BEST, COLUMNS, SEARCHED, STATES, TABLE, setting_cell
+from sb3_belief.study.trials_table import BEST, COLUMNS, SEARCHED, STATES, setting_cell
 from sb3_belief.study.tuning_space import SearchChoices, SearchRange
-from sb3_belief.study.tuning_spec import SPEC, load_tuning
+from sb3_belief.study.tuning_spec import load_tuning
 from sb3_belief.zoo.errors import ConfigError, reason_of
+from sb3_belief.zoo.run_files import SPEC, TABLE
 
 
 def reported_tuning(folder: Path) -> TuningFacts:

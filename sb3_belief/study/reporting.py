@@ -30,8 +30,8 @@ from sb3_belief.study.reported_logs import reported_logs
 from sb3_belief.study.reported_study import is_study, reported_study
 from sb3_belief.study.reported_tuning import reported_tuning
 from sb3_belief.study.run_reading import diagnostic_series, evaluation_series
-from sb3_belief.study.tuning_folder import is_tuning
 from sb3_belief.zoo.errors import ConfigError, reason_of, short, unknown_setting
+from sb3_belief.zoo.run_files import is_tuning
 from sb3_belief.zoo.run_folder import VIEWER
 
 RUNS, BUNDLE = "runs", "vega.js"

@@ -15,7 +15,7 @@ import yaml
 from sb3_belief.report.evaluations import read_evaluations
 from sb3_belief.report.learning_curve import read_episodes, smooth
 from sb3_belief.report.study_page.facts import DIAGNOSTICS, Series
-from sb3_belief.study.tuning_folder import is_tuning
+from sb3_belief.zoo.run_files import is_tuning
 from sb3_belief.zoo.run_folder import CONFIG, RECORD
 from sb3_belief.zoo.run_lock import LOCK
 

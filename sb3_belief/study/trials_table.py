@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from sb3_belief.common.durable_files import replaced_file
 from sb3_belief.common.versions import __version__
 from sb3_belief.study.tuning_spec import TuningSpec
+from sb3_belief.zoo.run_files import TABLE
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-TABLE, BEST = "trials.csv", "best.yml"
+#: The settings of the best trial
+BEST = "best.yml"
 #: Columns of the table before those of the searched settings, which are named ``search/<setting>``
 COLUMNS = ("trial", "state", "objective", "value", "seed_values", "evaluations", "repeats", "started", "seconds", "error")
 #: What stands before the names of these

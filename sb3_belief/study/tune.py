@@ -9,12 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from sb3_belief.common.durable_files import make_folder, replaced_file
-from sb3_belief.study.trials_table import BEST, TABLE, best_trial
+from sb3_belief.study.trials_table import BEST, best_trial
 from sb3_belief.study.tuning import exclusive, run_trials, update_results
-from sb3_belief.study.tuning_spec import SPEC, TuningSpec, load_tuning
-from sb3_belief.study.tuning_storage import MOST_ATTEMPTS, STORAGE, Storage
+from sb3_belief.study.tuning_spec import TuningSpec, load_tuning
+from sb3_belief.study.tuning_storage import MOST_ATTEMPTS, Storage
 from sb3_belief.zoo.errors import ConfigError, RunFailed, reason_of
 from sb3_belief.zoo.preflight import check_device, check_folder
+from sb3_belief.zoo.run_files import SPEC, STORAGE, TABLE
 
 # Seconds that workers have to save after they were asked to end
 _TO_END = 60.0

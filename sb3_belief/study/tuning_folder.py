@@ -4,19 +4,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from sb3_belief.study.trials_table import TABLE
-from sb3_belief.study.tuning_spec import SPEC
-from sb3_belief.study.tuning_storage import STORAGE
-
-
-def is_tuning(folder: Path) -> bool:
-    """
-    Return whether a folder is that of a tuning. The file of one alone, which may lie anywhere, makes none.
-
-    :param folder: The folder
-    :return: Whether it has the files of one
-    """
-    return (folder / SPEC).is_file() and any((folder / name).is_file() for name in (TABLE, STORAGE))
+from sb3_belief.zoo.run_files import is_tuning
 
 
 def tuning_folders(folder: Path) -> Iterator[Path]:

@@ -15,8 +15,6 @@ from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.train_options import TrainOptions
 from sb3_belief.zoo.yaml_data import merge, read_file
 
-#: The specification in the folder of a tuning
-SPEC = "tune.yml"
 #: Seed of the first run of a trial, far from those of studies: what is reported must not be what settings were chosen on
 FIRST_SEED = 1000
 _OBJECTIVES = ("return", "success")

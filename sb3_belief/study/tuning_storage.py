@@ -9,13 +9,13 @@ import numpy as np
 
 from sb3_belief.study.tuning_spec import TuningSpec
 from sb3_belief.zoo.errors import ConfigError, RunFailed, cause
+from sb3_belief.zoo.run_files import STORAGE
 from sb3_belief.zoo.run_lock import run_lock
 
 if TYPE_CHECKING:
     import optuna
     from optuna.trial import FrozenTrial
 
-STORAGE = "study.db"
 TRIALS = "trials"
 #: Attributes of trials: whether its process ended before it did, of which trial it is a repetition, and which try that is
 KILLED, REPEATS, ATTEMPT = "killed", "repeats", "attempt"

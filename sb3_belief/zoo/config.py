@@ -23,7 +23,7 @@ from sb3_belief.vec_env.team_vec_env import TeamVecEnv
 from sb3_belief.zoo.checks import Location
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import Algo, get_algo, get_env, load_env
-from sb3_belief.zoo.partners import PartnersConfig, partners_config
+from sb3_belief.zoo.partners import PartnersConfig, partners_config, without_replaced
 from sb3_belief.zoo.settings import RUN_KEYS, SettingsChecker, observation_arguments
 from sb3_belief.zoo.yaml_data import merge, parse_pairs, read_file
 
@@ -204,6 +204,7 @@ def load_config(
     for location, layer in layers:
         if not isinstance(layer, dict):
             raise ConfigError(f"{location.text}: must be a mapping of settings, not {short(layer)}.")
+    layers = without_replaced(layers)
 
     n_leading, policy = len(get_env(env_id, "--env").leading), _last(layers, "policy")[1]
     span_source, span = _last(layers, "memory_span")

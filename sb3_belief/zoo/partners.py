@@ -18,7 +18,7 @@ run that is continued meets the partners that it has met before.
 import glob
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from sb3_belief.team import PartnerPool, PartnersVecEnv, TeamVecEnv
 from sb3_belief.zoo.checks import Location, accepted_arguments, check_value
 from sb3_belief.zoo.errors import ConfigError, short, unknown_setting
 from sb3_belief.zoo.names import resolve
-from sb3_belief.zoo.run_files import BEST_MODEL, CHECKPOINTS, TEAM
+from sb3_belief.zoo.run_files import BEST_MODEL, CHECKPOINTS, TEAM, is_tuning
 from sb3_belief.zoo.yaml_data import parse
 
 _FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -108,11 +108,10 @@ def check_partners(given: Mapping[str, Any] | None, location: Location) -> dict[
         for name, member in checked.pop("members", {}).items()
     }
     patterns = checked.pop("runs", [])
-    for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        for name, path in _matches(pattern, location.key("runs")).items():
-            if name in members:
-                raise ConfigError(f"{location.text}: two members are called {name!r}: give one a name of its own in members.")
-            members[name] = path
+    for name, path in _matches([patterns] if isinstance(patterns, str) else patterns, location.key("runs")).items():
+        if name in members:
+            raise ConfigError(f"{location.text}: two members are called {name!r}: give one a name of its own in members.")
+        members[name] = path
     if {"members", "runs"} & given.keys():
         checked["members"] = members
     for key in ("learners", "held_out"):
@@ -157,12 +156,13 @@ def partners_of_flag(given: str) -> dict[str, Any]:
     Return the settings that the flag ``--partners`` stands for.
 
     :param given: A YAML file that holds what the setting ``partners`` holds; or, beside the learners that other settings name,
-        a folder with runs, each of which is a member, or the folder of a run or a zip, which is then the only one
+        a folder with runs, of which each that has saved a team is a member, or the folder of a run or a zip, which is then the
+        only one
     :return: The setting
-    :raises ConfigError: If the file cannot be read
+    :raises ConfigError: If the file cannot be read, or no run in the folder has saved a team
     """
     if not given.endswith((".yml", ".yaml")):
-        return {"members": _runs_in(Path(given)) or {_name_of(Path(given)): given}}
+        return {"members": _runs_in(Path(given)) or {_names_of([Path(given)])[0]: given}}
     try:
         content = parse(Path(given).read_text(encoding="utf-8"), f"--partners {given}")
     except (OSError, UnicodeDecodeError) as error:
@@ -173,11 +173,25 @@ def partners_of_flag(given: str) -> dict[str, Any]:
 
 
 def _runs_in(folder: Path) -> dict[str, str]:
-    """Return the runs within a folder that is none itself, by their paths in it."""
+    """
+    Return the runs within a folder that is none itself, by their paths in it, but for the trials of tunings: each has settings
+    of its own, and is short.
+    """
     if not folder.is_dir() or _saved_team(folder) is not None:
         return {}
-    found = {path.parent for name in (BEST_MODEL, TEAM) for path in folder.rglob(name)}
-    return {path.relative_to(folder).as_posix(): str(path) for path in sorted(found, key=lambda path: _by_numbers(str(path)))}
+    found: dict[str, str] = {}
+    for path, folders, _ in os.walk(folder):
+        here = Path(path)
+        if here != folder and is_tuning(here):
+            folders.clear()
+        elif _saved_team(here) is not None:
+            found[here.relative_to(folder).as_posix()] = path
+    if not found:
+        raise ConfigError(
+            f"--partners: no run in {short(str(folder))} has saved a team ({BEST_MODEL} or {TEAM}): give the folder of a run"
+            " that has, or one with such runs."
+        )
+    return dict(sorted(found.items(), key=lambda item: _by_numbers(item[0])))
 
 
 def _saved_team(folder: Path) -> Path | None:
@@ -217,21 +231,21 @@ def _partner(source: str, location: Location) -> Any:
     return resolve(source.replace(":", "."), location.text, location.extra_packages)
 
 
-def _matches(pattern: str, location: Location) -> dict[str, str]:
-    """Return the runs and zips that a pattern of paths stands for, by name."""
-    found: dict[str, str] = {}
-    for match in sorted(glob.glob(pattern, recursive=True), key=_by_numbers):
-        path = Path(match)
-        if path.suffix == ".zip" or _saved_team(path) is not None:
-            name = _name_of(path)
-            if name in found:
-                raise ConfigError(
-                    f"{location.text}: two members are called {name!r}: give them names of their own in members."
-                )
-            found[name] = _source(match, location)
-    if not found:
-        raise ConfigError(f"{location.text}: no folder of a run and no zip matches {pattern!r}.")
-    return found
+def _matches(patterns: Sequence[str], location: Location) -> dict[str, str]:
+    """Return the runs and zips that patterns of paths stand for, by name."""
+    found: list[Path] = []
+    for pattern in patterns:
+        paths = map(Path, sorted(glob.glob(pattern, recursive=True), key=_by_numbers))
+        matches = [path for path in paths if path.suffix == ".zip" or _saved_team(path) is not None]
+        if not matches:
+            raise ConfigError(f"{location.text}: no folder of a run and no zip matches {pattern!r}.")
+        found += matches
+    members: dict[str, str] = {}
+    for name, path in zip(_names_of(found), found, strict=True):
+        if name in members:
+            raise ConfigError(f"{location.text}: two members are called {name!r}: give them names of their own in members.")
+        members[name] = _source(str(path), location)
+    return members
 
 
 def _by_numbers(path: str) -> list[Any]:
@@ -239,7 +253,37 @@ def _by_numbers(path: str) -> list[Any]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path)]
 
 
-def _name_of(path: Path) -> str:
-    """Return the name of a member: of a run ``<algo>/<env>_<k>``, of a zip its folder and its name."""
-    parts = Path(os.path.abspath(path)).parts
-    return "/".join([part.removesuffix(".zip") for part in parts if part != CHECKPOINTS][-2:])
+def _names_of(paths: Sequence[Path]) -> list[str]:
+    """
+    Return the names of members: the ends of their paths, of a run ``<algo>/<env>_<k>``, of a zip its folder and its name, and
+    longer ones where two would be called the same.
+    """
+    parts = [
+        [part.removesuffix(".zip") for part in Path(os.path.abspath(path)).parts if part != CHECKPOINTS] for path in paths
+    ]
+    for length in range(2, max(map(len, parts), default=2) + 1):
+        names = ["/".join(each[-length:]) for each in parts]
+        if len(set(names)) == len(names):
+            return names
+    return ["/".join(each[-2:]) for each in parts]
+
+
+def without_replaced(layers: Sequence[tuple[Location, dict[str, Any]]]) -> list[tuple[Location, dict[str, Any]]]:
+    """
+    Leave out of sources of settings the partners in whose place a later source has others or none, with what is said of them
+    by name. Those with whom a run was trained may have been moved or deleted since.
+
+    :param layers: Settings with the places where they are given, in the order in which they override each other
+    :return: The same without them
+    """
+    kept: list[tuple[Location, dict[str, Any]]] = []
+    replaced = False
+    for location, layer in reversed(layers):
+        partners = layer.get("partners")
+        names_some = isinstance(partners, dict) and bool(partners.keys() & {"members", "runs"})
+        if replaced and names_some:
+            rest = {key: value for key, value in partners.items() if key not in ("members", "runs", "weights", "held_out")}
+            layer = {**layer, "partners": rest}
+        kept.append((location, layer))
+        replaced = replaced or names_some or ("partners" in layer and partners is None)
+    return kept[::-1]

@@ -71,13 +71,14 @@ class ShownEnvironment:
     adapter: Callable[[TeamVecEnv], TeamVecEnv] | None = None
 
 
-def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironment:
+def environment_of(path: Path, saved: ShownTeam, command: str, with_partners: bool = True) -> ShownEnvironment:
     """
     Return the environment that a team was trained in, or that the options name.
 
     :param path: Zip of the team
     :param saved: The options
     :param command: Name of the command, for error messages
+    :param with_partners: Whether partners are in it, those of its run or of the options. They need not be there otherwise
     :return: The environment, without a render mode
     :raises ConfigError: If it is unknown, or its settings are refused
     """
@@ -86,7 +87,7 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
         make_env = load_env(saved.env, "--env", packages)
         given, n_leading = parse_pairs(saved.env_kwargs, "--env-kwargs"), len(get_env(saved.env, "--env").leading)
         kwargs = check_call(make_env, given, Location("--env-kwargs", packages), skip=n_leading, of_env=True)
-        return ShownEnvironment(saved.env, kwargs, None, partners=_given_partners(path, saved))
+        return ShownEnvironment(saved.env, kwargs, None, partners=_given_partners(path, saved) if with_partners else None)
     run = run_of(path)
     if run is None:
         raise ConfigError(
@@ -96,8 +97,17 @@ def environment_of(path: Path, saved: ShownTeam, command: str) -> ShownEnvironme
     algo, env_id, conf_file = run
     check_record(run, packages, trust=saved.trust)
     folder = None if saved.trust else conf_file.parent
-    config = load_config(algo, env_id, str(conf_file), env_kwargs=saved.env_kwargs, extra_packages=packages, run_folder=folder)
-    partners = config.partners if saved.partners is None else _given_partners(path, saved)
+    keeps_its_own = with_partners and saved.partners is None
+    config = load_config(
+        algo,
+        env_id,
+        str(conf_file),
+        env_kwargs=saved.env_kwargs,
+        extra_packages=packages,
+        run_folder=folder,
+        overrides=[] if keeps_its_own else [(command, {"partners": None})],
+    )
+    partners = _given_partners(path, saved) if with_partners and not keeps_its_own else config.partners
     return ShownEnvironment(
         config.env_id,
         config.env_kwargs,

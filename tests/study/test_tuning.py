@@ -95,7 +95,7 @@ def test_the_best_settings_train(undisturbed, tmp_path):
 
 def test_a_report_reads_what_was_written(undisturbed):
     from sb3_belief.study.reported_tuning import reported_tuning
-    from sb3_belief.study.tuning_folder import is_tuning
+    from sb3_belief.zoo.run_files import is_tuning
 
     facts = reported_tuning(undisturbed)
     assert is_tuning(undisturbed) and len(facts.trials) == facts.n_trials == 4

@@ -172,6 +172,55 @@ def test_members_of_a_flag_take_the_place_of_those_of_a_file(runs, tmp_path):
     assert both == {"car_1": f"{run}/team.zip:car_3", "car_2": drive}
 
 
+def test_who_has_moved_is_not_missed_where_others_take_their_place(runs, tmp_path, capsys):
+    old = tmp_path / "old.zip"
+    old.write_bytes((runs / "ppo" / f"{EASY}_1" / "team.zip").read_bytes())
+    content: dict[str, Any] = {"learners": "car_0", "members": {"old": str(old), "other": f"{HERE}:drive"}}
+    content |= {"held_out": "old", "weights": [1.0, 2.0]}
+    words = ["--partners", write(tmp_path / "p.yml", content), "--eval-freq", "-1"]
+    assert train(tmp_path / "logs", *words, algo="belief_ppo") == 0
+    old.rename(tmp_path / "new.zip")
+    run, new = tmp_path / "logs" / "belief_ppo" / f"{EASY}_1", str(tmp_path / "new.zip")
+    words = ["--allow-package", "tests"]
+    episode = ["--episodes", "1", "--output", str(tmp_path / "episode.gif"), *words]
+    assert main(["enjoy", str(run), *episode]) == 2
+    assert f"there is no file or folder '{old}'" in capsys.readouterr().err
+    assert main(["enjoy", str(run), *episode, "--partners", new]) == 0
+    further = ["-i", str(run), "-n", "80", "-f", str(tmp_path / "logs"), "--verbose", "0", "--eval-freq", "-1", *words]
+    assert train_main([*further, "--partners", new]) == 0
+    config = load_config("belief_ppo", EASY, str(run.with_name(f"{EASY}_2") / "config.yml"), extra_packages=("tests",))
+    # With what was said of them by name
+    assert config.partners is not None and list(config.partners.pool.members.values()) == [new]
+    measure = ["--steps", "0", "--repetitions", "1", "--episodes", "1"]
+    assert main(["adapt", str(run), "--partners", str(runs), *measure, *words]) == 0
+
+
+def test_runs_are_called_by_the_shortest_ends_of_their_paths_that_differ(tmp_path):
+    location, names = Location("partners"), ("seed_2", "seed_10")
+    paths = [tmp_path / "cells" / name / "ppo" / f"{EASY}_1" for name in names]
+    for path in paths:
+        path.mkdir(parents=True)
+        (path / "team.zip").write_bytes(b"")
+    (tmp_path / "tuning" / "ppo").mkdir(parents=True)
+    for name in ("tune.yml", "trials.csv", "ppo/team.zip"):
+        (tmp_path / "tuning" / name).write_bytes(b"")
+    runs = f"{tmp_path}/cells/*/ppo/*"
+    checked = check_partners({"runs": runs}, location)
+    assert checked == {
+        "members": {f"{name}/ppo/{EASY}_1": f"{path}/team.zip" for name, path in zip(names, paths, strict=True)}
+    }
+    assert check_partners({"runs": f"{paths[0]}"}, location) == {"members": {f"ppo/{EASY}_1": f"{paths[0]}/team.zip"}}
+    with pytest.raises(ConfigError, match=f"two members are called 'ppo/{EASY}_1'"):
+        check_partners({"runs": [runs, str(paths[0])]}, location)
+    # A folder's are called by their paths in it, without what was tried in a tuning
+    assert partners_of_flag(str(tmp_path)) == {
+        "members": {f"cells/{name}/ppo/{EASY}_1": str(path) for name, path in zip(names, paths, strict=True)}
+    }
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"no run in .* has saved a team"):
+        partners_of_flag(str(tmp_path / "empty"))
+
+
 def test_draws_are_those_of_the_runs_seed_unless_the_pool_has_its_own(tmp_path):
     members = {name: f"{HERE}:{name}" for name in ("brake", "drive")}
     common = {"learners": "car_0", "members": members, "redraw_unit": "rollouts", "per_copy": False}
