@@ -210,15 +210,18 @@ def play_all(
     :param names: Keys of ``GAMES``
     :param beliefs: Variants of the belief; each game is played with those among them that it compares
     :param seeds: Seeds of the runs
-    :param jobs: Number of processes
+    :param jobs: Number of processes; with one it is this one that plays
     :param rollouts: Number of rollouts of the training, instead of the games'
     :return: ``{(game, variant): [result of each seed]}``
     """
     beliefs, seeds = list(beliefs), list(seeds)
     pairs = [(name, belief) for name in names for belief in (*GAMES[name].beliefs, ADAPTIVE) if belief in beliefs]
     runs = [(name, belief, seed, rollouts) for name, belief in pairs for seed in seeds]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        results = list(pool.map(play, *zip(*runs, strict=True)))
+    if jobs == 1:
+        results = [play(*run) for run in runs]
+    else:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            results = list(pool.map(play, *zip(*runs, strict=True)))
     return {pair: results[i * len(seeds) : (i + 1) * len(seeds)] for i, pair in enumerate(pairs)}
 
 

@@ -30,13 +30,15 @@ def test_a_belief_follows_a_leader_whom_no_weights_can_know():
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    """Play the games that the tests below need, in as many processes as there are cores, and remember the results."""
+    """Play the games that the tests below need, and remember the results."""
     played: dict[tuple[str, str], list[Played]] = {}
+    # Where there is one seed, what processes import takes longer than they save: other tests have the other cores
+    jobs = 1 if len(SEEDS) == 1 else os.cpu_count() or 1
 
     def get(game: str, belief: str) -> list[Played]:
         if (game, belief) not in played:
             beliefs, rollouts = next(part for part in PLAYED[game] if belief in part[0])
-            played.update(play_all([game], beliefs, SEEDS, jobs=os.cpu_count() or 1, rollouts=rollouts))
+            played.update(play_all([game], beliefs, SEEDS, jobs=jobs, rollouts=rollouts))
         return played[game, belief]
 
     return get
