@@ -29,6 +29,15 @@ class AgentValues(NamedTuple):
         """
         return AgentValues(*(part[:, steps].flatten(0, 1) for part in self))
 
+    def where(self, which: th.Tensor) -> "AgentValues":
+        """
+        Return some of the joint observations.
+
+        :param which: bool ``[B]``
+        :return: Values of as many as are true
+        """
+        return AgentValues(*(part[which] for part in self))
+
     def greedy(self) -> th.Tensor:
         """Return each agent's best legal action, that of the lowest index where several are: int64 ``[B, n]``."""
         return self.q.argmax(dim=-1)

@@ -206,20 +206,18 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
     def _update(self, batch: EpisodeBatch) -> dict[str, float]:
         """Make one update, and return what is logged of it."""
         values = self.policy.net(batch)
-        now, actions = values.rows(slice(None, -1)), batch.actions.flatten(0, 1)
+        # Where no step exists the values of actions may be minus infinity, of which not even the gradient could be left out
+        exists = batch.exists.flatten().bool()
+        now, actions = values.rows(slice(None, -1)).where(exists), batch.actions.flatten(0, 1)[exists]
         joint = self.policy.net.mixer.joint_value(now, actions)
-        targets = self.targets(batch, values).reshape(joint.shape)
-        errors = (joint - targets) ** 2
+        errors = (joint - self.targets(batch, values).flatten()[exists].reshape(joint.shape)) ** 2
         consistency = self.policy.net.mixer.consistency_loss(now, actions, joint)
-        exists = batch.exists.reshape(joint.shape)
-        losses = errors if consistency is None else errors + consistency
-        loss = (exists * losses).sum() / exists.sum()
+        loss = (errors if consistency is None else errors + consistency).mean()
         self.policy.optimizer.zero_grad()
         loss.backward()
         norm = th.nn.utils.clip_grad_norm_(self.policy.net.parameters(), self.max_grad_norm)
         self.policy.optimizer.step()
-        mean_value = (exists * joint.detach()).sum() / exists.sum()
-        return {"loss": loss.item(), "q_tot": mean_value.item(), "gradient_norm": norm.item()}
+        return {"loss": loss.item(), "q_tot": joint.detach().mean().item(), "gradient_norm": norm.item()}
 
     def targets(self, batch: EpisodeBatch, values: AgentValues | None = None) -> th.Tensor:
         """

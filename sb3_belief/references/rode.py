@@ -150,22 +150,23 @@ class RODE(ValueFactorisation):
         return {"effects_loss": loss.item()}
 
     def _learn_values(self, batch: EpisodeBatch) -> dict[str, float]:
-        policy, actions, roles = self.policy, batch.actions[..., 0], batch.actions[..., 1]
+        policy, now = self.policy, slice(None, -1)
         role_values, features = policy.pass_episodes(policy.net, batch)
-        now = slice(None, -1)
-        of_roles = AgentValues(role_values, features, batch.state).rows(now)
-        of_actions = policy.values_in(
-            policy.net,
-            *(part.flatten(0, 1) for part in (features[:, now], roles, batch.mask[:, now], batch.state[:, now])),
-        )
-        role_targets, action_targets = self.role_targets(batch)
-        starts = th.arange(roles.shape[1], device=self.device) % policy.role_interval == 0
+        # As in _update(), only steps that exist, and of roles those at which they are chosen
+        exists = batch.exists.flatten().bool()
+        begins = th.arange(batch.exists.shape[1], device=self.device) % policy.role_interval == 0
+        starts = exists & begins.repeat(len(batch.exists))
+        actions, roles = batch.actions.flatten(0, 1).unbind(dim=-1)
+        of_roles = AgentValues(role_values, features, batch.state).rows(now).where(starts)
+        seen, mask, state = (part[:, now].flatten(0, 1)[exists] for part in (features, batch.mask, batch.state))
+        of_actions = policy.values_in(policy.net, seen, roles[exists], mask, state)
+        role_targets, action_targets = (targets.flatten() for targets in self.role_targets(batch))
         losses = []
-        for joint, targets, counts in (
-            (policy.net.role_mixer.joint_value(of_roles, roles.flatten(0, 1)), role_targets, batch.exists * starts),
-            (policy.net.action_mixer.joint_value(of_actions, actions.flatten(0, 1)), action_targets, batch.exists),
+        for joint, targets in (
+            (policy.net.role_mixer.joint_value(of_roles, roles[starts]), role_targets[starts]),
+            (policy.net.action_mixer.joint_value(of_actions, actions[exists]), action_targets[exists]),
         ):
-            losses.append((counts * (joint.reshape(targets.shape) - targets) ** 2).sum() / counts.sum())
+            losses.append(((joint.reshape(targets.shape) - targets) ** 2).mean())
         policy.optimizer.zero_grad()
         (losses[0] + losses[1]).backward()
         norm = th.nn.utils.clip_grad_norm_(policy.net.parameters(), self.max_grad_norm)

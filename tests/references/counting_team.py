@@ -72,6 +72,29 @@ class CountingTeam(ParallelEnv):
         return {agent: {"action_mask": np.array(mask)} for agent, mask in masks.items()}
 
 
+class UnequalTeam(CountingTeam):
+    """
+    A ``CountingTeam`` whose episodes have 3, 4, 5 steps in turn, and after whose last step action 0 is not legal.
+
+    :param nothing: Whether no action at all is legal then
+    """
+
+    def __init__(self, nothing: bool = False, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.nothing, self._episode = nothing, 0
+
+    def reset(self, seed=None, options=None):
+        self.length, self._episode = 3 + self._episode % 3, self._episode + 1
+        return super().reset(seed, options)
+
+    def _infos(self):
+        infos = super()._infos()
+        if self.t == self.length:
+            for agent, n_actions in (("a", 2), ("b", 3)):
+                infos[agent]["action_mask"] = (np.arange(n_actions) == 1) & (not self.nothing)
+        return infos
+
+
 def joint_env(n_envs: int = 1, **kwargs: Any) -> JointVecEnv:
     """Return the game as one environment."""
     return JointVecEnv(make_team_env(lambda: CountingTeam(**kwargs), n_envs=n_envs))

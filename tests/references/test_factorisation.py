@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_belief.references.factorisation import ValueFactorisation
 from sb3_belief.references.factorised_policy import MIXERS
-from sb3_belief.references.joint_vec_env import joint_team
+from sb3_belief.references.joint_vec_env import JointVecEnv, joint_team
 from sb3_belief.team import Team, make_team_env
-from tests.references.counting_team import CountingTeam, joint_env
+from tests.references.counting_team import CountingTeam, UnequalTeam, joint_env
 
 
 def learner(env=None, **kwargs):
@@ -131,6 +131,24 @@ def test_the_loss_is_the_mean_over_the_steps_that_exist():
     alone = [model._update(model.replay_buffer.batch([episode]))["loss"] for episode in (short, long)]
     together = model._update(model.replay_buffer.batch([short, long]))["loss"]
     assert together == pytest.approx((1 * alone[0] + 3 * alone[1]) / 4, rel=1e-5)
+
+
+@pytest.mark.parametrize("mixer", MIXERS)
+@pytest.mark.parametrize("kwargs", [{}, {"truncates": True}, {"nothing": True}], ids=["ends", "limits", "nothing is legal"])
+def test_steps_that_do_not_exist_may_have_any_masks(mixer, kwargs):
+    env = JointVecEnv(make_team_env(lambda: UnequalTeam(**kwargs), n_envs=2))
+    model = learner(env, mixer=mixer, batch_size=4)
+    losses: list[dict[str, float]] = []
+    update = model._update
+
+    def record(batch):
+        losses.append(update(batch))
+        return losses[-1]
+
+    model._update = record
+    model.learn(60)
+    assert {len(episode["rewards"]) for episode in model.replay_buffer.episodes} == {3, 4, 5}
+    assert losses and np.isfinite([list(each.values()) for each in losses]).all() and weights(model).isfinite().all()
 
 
 def test_actions_are_legal_and_coins_are_thrown_for_each_agent_and_copy():
