@@ -61,7 +61,9 @@ class DPIQN(IQL):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        if not self.others_action_spaces and self.env is not None:
+        if self.others_action_spaces and self.env is not None:
+            check_same_others(self.env, self.others_action_spaces)
+        elif self.env is not None:
             self.others_action_spaces = self._checked_others(self.env)
         is_dict = isinstance(self.observation_space, spaces.Dict)
         self.replay_buffer_class = OthersDictReplayBuffer if is_dict else OthersReplayBuffer

@@ -27,7 +27,8 @@ class InferenceQNetwork(QNetwork):
 
     :param args: As of SB3's ``QNetwork``
     :param others_action_spaces: The others' action spaces, in order
-    :param kwargs: As of SB3's ``QNetwork``. The last width of ``net_arch`` is that of g and p, too
+    :param kwargs: As of SB3's ``QNetwork``. The last width of ``net_arch`` is that of g and p, too; without any it is that of
+        the features
     """
 
     #: Least value of the prediction's loss in the weight, set by the algorithm
@@ -38,7 +39,7 @@ class InferenceQNetwork(QNetwork):
         self.layout = action_layout(others_action_spaces)
         #: Loss and weight of each minibatch since the algorithm has read them
         self.recorded: list[tuple[float, float]] = []
-        n_actions, width = int(self.action_space.n), self.net_arch[-1]
+        n_actions, width = int(self.action_space.n), self._width
         self.q_net = nn.Sequential(*create_mlp(self._trunk_width, -1, self.net_arch, self.activation_fn))
         self.value_features = nn.Sequential(nn.Linear(width, width), nn.LeakyReLU())
         self.policy_features = nn.Sequential(nn.Linear(width, width), nn.LeakyReLU())
@@ -48,6 +49,11 @@ class InferenceQNetwork(QNetwork):
     @property
     def _trunk_width(self) -> int:
         return self.features_dim
+
+    @property
+    def _width(self) -> int:
+        # Without a layer of its own, as behind a convolutional network, the trunk is what it is given
+        return int([self._trunk_width, *self.net_arch][-1])
 
     def features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -117,7 +123,7 @@ class RecurrentInferenceQNetwork(InferenceQNetwork):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        width = self.net_arch[-1]
+        width = self._width
         self.value_memory, self.policy_memory = (
             nn.LSTM(width, width, batch_first=True),
             nn.LSTM(width, width, batch_first=True),

@@ -229,7 +229,7 @@ class IQL(SafeFilesMixin, DQN):
             # SB3 resets the environment
             self._return_runs = np.zeros(self.n_envs, dtype=bool)
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if self.exploration_steps is not None:
+        if self.exploration_steps is not None and self._total_timesteps:
             # As a share of all steps, which are known here only
             share = self.exploration_steps / self._total_timesteps
             self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, share)

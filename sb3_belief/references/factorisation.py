@@ -1,5 +1,6 @@
 """Value factorisation: VDN, QMIX, QPLEX and QTRAN. Uses the global state in training."""
 
+import warnings
 from typing import Any, ClassVar
 
 import numpy as np
@@ -105,7 +106,7 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
             train_freq=(1, "step"),
             gradient_steps=gradient_steps,
             replay_buffer_class=EpisodeReplayBuffer,
-            policy_kwargs={**(policy_kwargs or {}), "mixer": mixer},
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -125,6 +126,19 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
         self._last_states: tuple[np.ndarray, ...] | None = None
         if _init_setup_model:
             self._setup_model()
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        """Return what of the algorithm's arguments is the policy's."""
+        return {"mixer": self.mixer}
+
+    def _setup_model(self) -> None:
+        users = self.policy_kwargs
+        self.policy_kwargs = {**users, **self._policy_arguments()}
+        try:
+            super()._setup_model()
+        finally:
+            # The user's own arguments are what is saved, and compared on load
+            self.policy_kwargs = users
 
     # Acting
 
@@ -256,4 +270,13 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> "ValueFactorisation":
         """Learn as SB3's algorithms do. The arguments are those of DQN's ``learn``."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        before = self._n_updates
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        if self._n_updates == before and self.replay_buffer.size() < self.batch_size:
+            warnings.warn(
+                f"{type(self).__name__} has not learned anything: {self.replay_buffer.size()} episodes have ended in"
+                f" {self.num_timesteps:,} steps, and an update takes batch_size={self.batch_size} of them. Train for longer,"
+                " or make episodes end, by a limit for instance.",
+                stacklevel=2,
+            )
+        return self

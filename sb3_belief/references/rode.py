@@ -99,11 +99,13 @@ class RODE(ValueFactorisation):
             device=device,
             _init_setup_model=False,
         )
-        # Of the parent, whose policy has one of several
-        del self.policy_kwargs["mixer"]
         self.role_start = role_start
         if _init_setup_model:
             self._setup_model()
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        # It has mixers of its own
+        return {}
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_belief.belief_ppo import BeliefPPO
 from sb3_belief.common.action_masks import mask_parts
 from sb3_belief.common.exceptions import add_note
 from sb3_belief.team.model_parts import shown_space
@@ -18,6 +16,8 @@ from sb3_belief.vec_env.team_vec_env import TeamObs, TeamStep
 
 # An agent that is not masked chooses what is impossible within its first random actions, or hardly ever
 N_STEPS = 200
+# Algorithms of which there is one with masks, whose name begins with "Maskable"
+_WITH_MASKS = ("AMFPPO", "BeliefPPO", "MAPPO", "PPO")
 
 
 class MaskCheck:
@@ -92,6 +92,5 @@ def _possible(space: spaces.Space, actions: np.ndarray, masks: np.ndarray) -> np
 
 
 def _masked_class(model: BaseAlgorithm) -> str:
-    if isinstance(model, BeliefPPO):
-        return "MaskableBeliefPPO"
-    return "MaskablePPO" if isinstance(model, PPO) else "MaskablePPO or MaskableBeliefPPO"
+    found = next((each.__name__ for each in type(model).__mro__ if each.__name__ in _WITH_MASKS), None)
+    return "MaskablePPO or MaskableBeliefPPO" if found is None else f"Maskable{found}"

@@ -244,8 +244,34 @@ def test_wrong_use(make, message):
         make()
 
 
-def test_another_environment_with_other_others_is_refused():
+def test_another_environment_with_other_others_is_refused(tmp_path):
     model = played()
+    model.save(tmp_path / "model")
     team = Team(IQL, "MlpPolicy", make_team_env(ToyEnv, env_kwargs={"n_agents": 3}, seed=0), seed=0, **Q_KWARGS)
     with pytest.raises(ValueError, match="others of this environment"):
         model.set_env(team.agents["agent_0"].get_env())
+    with pytest.raises(ValueError, match="others of this environment"):
+        DPIQN.load(tmp_path / "model", env=team.agents["agent_0"].get_env())
+
+
+class Pictures(ToyEnv):
+    """A ``ToyEnv`` that shows noise."""
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+    def observations(self):
+        return {agent: np.random.default_rng(self.t).integers(256, size=(36, 36, 3), dtype=np.uint8) for agent in self.agents}
+
+
+def test_without_layers_of_its_own_the_trunk_is_what_it_is_given():
+    own = {**Q_KWARGS, "policy_kwargs": {}, "buffer_size": 40}
+    team = Team(DPIQN, "CnnPolicy", make_team_env(Pictures, n_envs=2, seed=0), seed=0, **own).learn(40)
+    assert team.agents["agent_0"].q_net.others.in_features == 512
+    narrow = {**Q_KWARGS, "policy_kwargs": {"net_arch": []}}
+    for algorithm, width in ((DPIQN, 2), (DRPIQN, 2)):
+        env = make_team_env(ToyEnv, n_envs=2, seed=0, **window(algorithm))
+        team = Team(algorithm, "MlpPolicy", env, seed=0, **narrow).learn(40)
+        assert (
+            team.agents["agent_0"].q_net.others.in_features == width and np.isfinite(parameters(team.agents["agent_0"])).all()
+        )

@@ -200,8 +200,9 @@ def test_epsilon_falls_in_as_many_steps_however_long_the_training_is(total):
     kwargs = {**Q_KWARGS, "exploration_fraction": 0.1, "exploration_steps": 100}
     eps = {"exploration_initial_eps": 0.8, "exploration_final_eps": 0.2}
     team = Team(IQL, "MlpPolicy", make_team_env(ToyEnv, n_envs=2, seed=0), seed=0, **kwargs, **eps)
-    team.learn(60, agent_callbacks={"agent_0": Watch()})
+    team.learn(0).learn(60, agent_callbacks={"agent_0": Watch()})
     team.learn(total - 60, agent_callbacks={"agent_0": Watch()}, reset_num_timesteps=False)
+    team.learn(0, reset_num_timesteps=False)
     # The rate with which a step is made is that of the steps before it
     expected = {step: max(0.2, 0.8 - 0.6 * (step - 2) / 100) for step in range(4, total + 1, 2)}
     assert {step: rate for step, rate in rates.items() if step > 2} == pytest.approx(expected)

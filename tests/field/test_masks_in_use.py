@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import CallbackList, EvalCallback, Every
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief import BeliefPPO, MaskableBeliefPPO
+from sb3_belief.baselines import AMFPPO
 from sb3_belief.team.masks import _possible
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env
 from tests.team.toy_envs import MaskedEnv, ToyEnv
@@ -59,6 +60,7 @@ def masked_team(**kwargs):
     [
         (PPO, "MlpPolicy", KWARGS, "PPO takes none and .* Use MaskablePPO,"),
         (BeliefPPO, "BeliefPolicy", {**KWARGS, "belief": "none"}, "BeliefPPO takes none and .* Use MaskableBeliefPPO,"),
+        (AMFPPO, "MlpPolicy", {**KWARGS, "policy_kwargs": {"hidden_dim": 8}}, "AMFPPO takes none and .* Use MaskableAMFPPO,"),
         (A2C, "MlpPolicy", {}, "A2C takes none and .* Use MaskablePPO or MaskableBeliefPPO,"),
     ],
 )

@@ -35,7 +35,9 @@ def test_learns_acts_and_is_saved(mixer, policy_kwargs, tmp_path):
     # Of 2 copies with 3 steps each, 6 episodes of each have ended, and one for each copy begins an update
     assert model._n_updates == 6
     model.save(tmp_path / "model")
-    loaded = ValueFactorisation.load(tmp_path / "model", env=joint_env(n_envs=2))
+    # The user's own arguments are compared with those that are saved
+    own = {"hidden_dim": 8, **policy_kwargs}
+    loaded = ValueFactorisation.load(tmp_path / "model", env=joint_env(n_envs=2), policy_kwargs=own)
     assert th.equal(weights(loaded), weights(model)) and loaded.exploration_rate == model.exploration_rate
     returns = [evaluate_policy(each, joint_env(n_envs=2), 4) for each in (model, loaded)]
     assert returns[0] == returns[1]
@@ -149,6 +151,11 @@ def test_steps_that_do_not_exist_may_have_any_masks(mixer, kwargs):
     model.learn(60)
     assert {len(episode["rewards"]) for episode in model.replay_buffer.episodes} == {3, 4, 5}
     assert losses and np.isfinite([list(each.values()) for each in losses]).all() and weights(model).isfinite().all()
+
+
+def test_who_has_learned_nothing_says_so():
+    with pytest.warns(UserWarning, match=r"has not learned anything: 0 episodes have ended in 40 steps, .* batch_size=2"):
+        learner(joint_env(n_envs=2, length=10**6)).learn(40)
 
 
 def test_actions_are_legal_and_coins_are_thrown_for_each_agent_and_copy():

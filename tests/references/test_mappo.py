@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from torch import nn
 
+from sb3_belief import AgentEnv
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy
 from sb3_belief.cli.main import main
 from sb3_belief.references.adapters import shared_with_state
@@ -173,6 +175,17 @@ def test_it_predicts_from_its_own_observation(algorithm, env):
     single, _ = model.predict(obs[OWN][0], deterministic=True, **{key: mask[0] for key, mask in masks.items()})
     assert single.shape == ()
     assert single == whole[0]
+
+
+def test_it_can_be_the_partner_of_another_learner(tmp_path):
+    team = make_team(Stateful).learn(28)
+    team.save(tmp_path / "team.zip")
+    env = make_team_env(Stateful, n_envs=2, seed=0)
+    learner = Team(PPO, "MlpPolicy", env, partners={"agent_1": str(tmp_path / "team.zip")}, **SMALL).learn(28)
+    assert learner.possible_agents == ["agent_0"]
+    agent_env = AgentEnv(Stateful, "agent_0", {"agent_1": team.agents["agent_1"]})
+    agent_env.reset(seed=0)
+    assert agent_env.step(0)[4]["others_actions"].sum() == 1
 
 
 ALONE = """

@@ -263,6 +263,9 @@ def _statistics(name: str, given: Any, observation_space: spaces.Space, trust: T
 def _check_spaces(name: str, model: Any, observation_space: spaces.Space, action_space: spaces.Space) -> None:
     for kind, wanted in (("observation", observation_space), ("action", action_space)):
         found = getattr(model, f"{kind}_space", wanted)
+        if kind == "observation":
+            # An agent whose critic saw more in training acts on its own part
+            found = getattr(getattr(model, "policy", None), "own_space", found)
         if found not in (wanted, as_models_see(wanted)):
             raise ValueError(
                 f"The partner {name!r} has been made for the {kind} space {found}, but {name!r} has {wanted} in this"
