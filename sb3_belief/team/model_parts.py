@@ -1,10 +1,13 @@
 """The networks and optimizers of a model, by the paths at which they are found, and the wrappers around its environment."""
 
 from collections.abc import Iterator
+from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from torch import nn
 
@@ -48,6 +51,31 @@ def wrappers_of(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
     while isinstance(env, VecEnvWrapper):
         yield env
         env = env.venv
+
+
+# What reset() makes anew in a rollout buffer, besides its arrays
+_OF_ROLLOUT = {"pos", "full", "generator_ready"}
+
+
+def lasting_parts(buffer: RolloutBuffer) -> dict[str, Any]:
+    """
+    Return the attributes of a rollout buffer that hold beyond its rollout, such as what is replayed of past ones.
+
+    :param buffer: The buffer
+    :return: Those that ``reset()`` does not make anew, by name
+    """
+    return {name: value for name, value in vars(buffer).items() if name not in _OF_ROLLOUT and not holds_arrays(value)}
+
+
+def holds_arrays(value: Any) -> bool:
+    """
+    Return whether a value is an array, or a dict with one, at any depth.
+
+    :param value: The value
+    """
+    if isinstance(value, dict):
+        return any(holds_arrays(each) for each in value.values())
+    return isinstance(value, np.ndarray)
 
 
 def shown_space(model: BaseAlgorithm, kind: str) -> spaces.Space:

@@ -8,6 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_belief import BeliefPPO
 from sb3_belief import team as sb3_team
+from sb3_belief.team.checkpoints import Checkpoints
 from tests.team.helpers import PPO_KWARGS, Team, make_team_env, parameters
 from tests.team.toy_envs import BlinkingEnv
 
@@ -58,6 +59,18 @@ def test_a_training_goes_on_exactly(tmp_path):
     resumed = Team.load(tmp_path / "half.zip", env=env, exact=True)
     resumed.learn(64, reset_num_timesteps=False)
     assert same(whole, resumed) and histories(whole) == histories(resumed)
+
+
+def test_a_checkpoint_holds_what_is_in_the_workers(tmp_path):
+    # A callback of the library's, as others keep all agents in the main process
+    whole = Team(BeliefPPO, "BeliefPolicy", make_team_env(BlinkingEnv, n_envs=2, seed=0), seed=0, jobs=2, **ADAPTIVE)
+    whole.learn(96, callback=Checkpoints(str(tmp_path), save_freq=32, keep=10))
+    assert same(whole, learned(96))
+    for steps in (32, 64):
+        env = make_team_env(BlinkingEnv, n_envs=2, seed=0)
+        resumed = Team.load(tmp_path / f"team_{steps}_steps.zip", env=env, exact=True)
+        resumed.learn(96 - steps, reset_num_timesteps=False)
+        assert same(whole, resumed) and histories(whole) == histories(resumed)
 
 
 @pytest.mark.parametrize("normalize", [False, True])

@@ -25,7 +25,7 @@ from sb3_belief.belief_ppo.cut_returns import CutReturns
 from sb3_belief.common.plain_data import NotPlainError, PlainData, decode, encode
 from sb3_belief.common.rng import RngState
 from sb3_belief.common.safe_files.trust import MODEL_PACKAGES, Trust, is_allowed
-from sb3_belief.team.model_parts import wrappers_of
+from sb3_belief.team.model_parts import holds_arrays, lasting_parts, wrappers_of
 
 # Parts of a model that its zip or its team saves, and constants
 _NO_STATE = (nn.Module, th.optim.Optimizer, spaces.Space, BaseBuffer, Logger, VecEnv, th.device, str, type)
@@ -39,8 +39,6 @@ _OF_LEARN = {
     "env",
     "_vec_normalize_env",
 }
-# What reset() makes anew in a rollout buffer, besides its arrays
-_OF_ROLLOUT = {"pos", "full", "generator_ready"}
 _NOISE_MATRICES = ("exploration_mat", "exploration_matrices")
 _OF_WRAPPER = {"venv", "class_attributes", "num_envs"}
 
@@ -149,17 +147,12 @@ def _buffers(model: BaseAlgorithm) -> Iterator[tuple[str, BaseBuffer]]:
 
 
 def _buffer_state(buffer: BaseBuffer) -> dict[str, Any]:
-    values = {name: value for name, value in vars(buffer).items() if not (isinstance(value, _NO_STATE) or callable(value))}
+    parts = lasting_parts(buffer) if isinstance(buffer, RolloutBuffer) else vars(buffer)
+    values = {name: value for name, value in parts.items() if not (isinstance(value, _NO_STATE) or callable(value))}
     if isinstance(buffer, RolloutBuffer):
-        return {name: value for name, value in values.items() if name not in _OF_ROLLOUT and not _holds_arrays(value)}
+        return values
     n_rows = buffer.buffer_size if buffer.full else buffer.pos + 1
     return {name: _first_rows(value, n_rows, buffer.buffer_size) for name, value in values.items()}
-
-
-def _holds_arrays(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(_holds_arrays(each) for each in value.values())
-    return isinstance(value, np.ndarray)
 
 
 def _first_rows(value: Any, n_rows: int, size: int) -> Any:
@@ -221,7 +214,7 @@ def _put_into(owner: Any, values: Mapping[str, Any]) -> None:
 
 def _written_into(present: Any, value: Any) -> bool:
     """Write rows into an array that is larger, and tell whether that was so."""
-    if isinstance(present, dict) and isinstance(value, dict) and present.keys() == value.keys() and _holds_arrays(value):
+    if isinstance(present, dict) and isinstance(value, dict) and present.keys() == value.keys() and holds_arrays(value):
         return all([_written_into(present[key], value[key]) for key in value])
     if not (isinstance(present, np.ndarray) and isinstance(value, np.ndarray)):
         return False

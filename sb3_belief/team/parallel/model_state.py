@@ -18,7 +18,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from torch import nn
 
 from sb3_belief.team.batched_forward import BatchedForward
-from sb3_belief.team.model_parts import modules_of, optimizers_of
+from sb3_belief.team.model_parts import lasting_parts, modules_of, optimizers_of
 from sb3_belief.team.parallel.messages import Message, dumps, loads
 
 # Attributes of a model that stay where they are
@@ -149,7 +149,7 @@ class StateReader:
         """
         Read the state.
 
-        :param with_buffer: Whether to include the contents of the rollout buffer
+        :param with_buffer: Whether to include the rollout in the rollout buffer, beside what the buffer holds beyond it
         :return: The state, for :func:`write_state`
         :raises RuntimeError: If parameters or modules of a network were added, removed or replaced by other modules
         """
@@ -165,6 +165,7 @@ class StateReader:
             raise RuntimeError(
                 f"train() of {type(self._model).__name__} adds or removes parameters or modules of a network; use jobs=1."
             )
+        buffer = self._model.rollout_buffer
         state = {
             "tensors": {path: (tensor is self._tensors[path], tensor) for path, tensor in tensors.items()},
             "optimizers": {
@@ -173,7 +174,7 @@ class StateReader:
                 if id(optimizer) in self._known
             },
             "attributes": dumps(attributes, self._known),
-            "buffer": dumps(vars(self._model.rollout_buffer), self._known) if with_buffer else None,
+            "buffer": dumps(vars(buffer) if with_buffer else lasting_parts(buffer), self._known),
         }
         self._read_tensors = tensors
         return state
@@ -201,8 +202,7 @@ def write_state(model: Any, state: dict[str, Any]) -> None:
         vars(_at(model, path)).pop(name, None)
     for (path, name), value in attributes.items():
         vars(_at(model, path))[name] = value
-    if state["buffer"] is not None:
-        vars(model.rollout_buffer).update(loads(state["buffer"], lambda path: _at(model, path)))
+    vars(model.rollout_buffer).update(loads(state["buffer"], lambda path: _at(model, path)))
 
 
 def _write_tensors(model: BaseAlgorithm, tensors: dict[str, tuple[bool, th.Tensor]]) -> None:

@@ -193,7 +193,7 @@ class WorkerServer:
             write_agent_state(self._models[agent], self._rngs[agent], state)
 
     def sync(self) -> None:
-        """Send the models' states, without their rollout buffers."""
+        """Send the models' states, without the rollouts in their buffers."""
         self._read_states(with_buffers=False)
 
     def close(self) -> None:
