@@ -171,20 +171,22 @@ class PolicyGraph(nn.Module):
     def _check_policy(self, algorithm: str) -> None:
         """Refuse a policy of the user's own that makes its distributions in another way than SB3's."""
         inputs = self.examples(8)
-        observation, mask = self._arguments(inputs)
         with th.no_grad():
             outputs = self(*inputs)
-            if self._masks_before:
-                with self._masks_before(mask):
-                    made = self.policy.get_distribution(observation)
-            else:
-                made = self.policy.get_distribution(observation, *([] if mask is None else [mask]))
-            for name, expected in self._action_outputs(made).items():
-                if not th.allclose(outputs[name], expected, rtol=1e-3, atol=1e-5):
-                    raise ValueError(
-                        f"{algorithm} cannot be exported: the get_distribution() of its {type(self.policy).__name__} does "
-                        "something else than SB3's. Export it by torch.export, from a module of your own."
-                    )
+            for i in range(8):
+                # One at a time, since a policy that remembers several copies takes those of a batch for observations of these
+                observation, mask = self._arguments(tuple(part[i : i + 1] for part in inputs))
+                if self._masks_before:
+                    with self._masks_before(mask):
+                        made = self.policy.get_distribution(observation)
+                else:
+                    made = self.policy.get_distribution(observation, *([] if mask is None else [mask]))
+                for name, expected in self._action_outputs(made).items():
+                    if not th.allclose(outputs[name][i : i + 1], expected, rtol=1e-3, atol=1e-5):
+                        raise ValueError(
+                            f"{algorithm} cannot be exported: the get_distribution() of its {type(self.policy).__name__} does"
+                            " something else than SB3's. Export it by torch.export, from a module of your own."
+                        )
 
 
 def _why_not(policy: BasePolicy) -> str | None:

@@ -115,9 +115,11 @@ def test_no_action_of_another_space_is_remembered_unless_the_agent_did_nothing(s
     obs = observations_of(model, 1)
     with pytest.raises(ValueError, match="own_actions"):
         model.policy.remember(obs, {"b": 1}, own_actions=np.array(wrong))
-    if not isinstance(space, spaces.Box):
-        model.policy.remember(obs, {"b": 1}, own_actions=np.array(wrong), acted=np.array([False]))
-        assert not valid_rows(model.policy.history).own.any()
+    nothing = np.full(2, np.nan) if isinstance(space, spaces.Box) else np.array(wrong)
+    model.policy.remember(obs, {"b": 1}, own_actions=nothing, acted=np.array([False]))
+    assert not valid_rows(model.policy.history).own.any()
+    with pytest.raises(ValueError, match="rewards must be finite numbers"):
+        model.policy.remember(obs, {"b": 1}, rewards=np.array(["one"]))
     # Those beyond its bounds are clipped by an environment
     fits = [2.0, 0.0] if isinstance(space, spaces.Box) else [1, 1]
     model.policy.remember(obs, {"b": 1}, own_actions=np.array(fits))

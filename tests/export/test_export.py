@@ -19,6 +19,7 @@ from sb3_belief.baselines import AMFPPO, IAC
 from sb3_belief.belief_ppo import BeliefActorCriticPolicy, BeliefPPO, MaskableBeliefPPO
 from sb3_belief.common.action_masks import mask_parts
 from sb3_belief.export import export_model
+from sb3_belief.export.graph import PolicyGraph
 from sb3_belief.references import MAPPO, WithState
 from tests.baselines.test_iac import Unmasked
 from tests.belief_ppo.helpers import SMALL, make_model, observations_of
@@ -104,6 +105,21 @@ def expected_outputs(model, observations, masks=None):
         if policy.options.variant.samples:
             outputs["belief_std"] = believed.std
     return outputs
+
+
+def test_a_policy_that_remembers_several_copies_is_exported_as_one_of_them():
+    model = trained(BeliefPPO, dict(belief="adaptive"), {})
+    with th.no_grad():
+        # As sharp as after a longer training
+        model.policy.action_net.weight.mul_(100)
+    model.policy.remember(observations_of(model, 2), {"b": np.array([0, 1])}, copies=np.array([0, 1]))
+    assert model.policy.features_extractor.n_copies == 2
+    observations, inputs = inputs_of(model)
+    with th.no_grad():
+        found = PolicyGraph(model)(*map(th.as_tensor, inputs.values()))["action_probabilities"]
+    for i in range(N):
+        expected = expected_outputs(model, observations[i : i + 1])["action_probabilities"]
+        np.testing.assert_allclose(found[i : i + 1].numpy(), expected, atol=2e-6, rtol=2e-5)
 
 
 def run_onnx(path, inputs):
