@@ -13,7 +13,8 @@ import pytest
 
 from sb3_belief.common import processes
 from sb3_belief.common.processes import Inbox, is_dead, kill_workers, patience, start_context, start_worker, uninterrupted
-from tests.vec_env.test_worker_faults import LINUX, gone_within, marked, no_test_hangs, run_script  # noqa: F401 (a fixture)
+from tests.vec_env.scripts import LINUX, gone_within, marked, run_script
+from tests.vec_env.test_worker_faults import no_test_hangs  # noqa: F401 (a fixture)
 
 
 @LINUX

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from sb3_belief.cli.main import train_main
-from tests.vec_env.test_worker_faults import LINUX, gone_within, marked, no_test_hangs  # noqa: F401 (a fixture)
+from tests.vec_env.scripts import LINUX, gone_within, marked
+from tests.vec_env.test_worker_faults import no_test_hangs  # noqa: F401 (a fixture)
 
 TROUBLED = "tests.vec_env.faulty_envs:Troubled"
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -17,14 +17,8 @@ from sb3_belief.team.parallel import workers
 from tests.team.helpers import PPO_KWARGS, Team, parameters
 from tests.team.parallel.test_jobs import no_processes_stay, notes, toy_team
 from tests.team.toy_envs import ToyEnv
-from tests.vec_env.test_worker_faults import (  # noqa: F401 (one is a fixture)
-    LINUX,
-    WITH_WORKERS,
-    gone_within,
-    marked,
-    no_test_hangs,
-    run_script,
-)
+from tests.vec_env.scripts import LINUX, WITH_WORKERS, gone_within, marked, run_script
+from tests.vec_env.test_worker_faults import no_test_hangs  # noqa: F401 (a fixture)
 
 SMALL = {**PPO_KWARGS, "batch_size": 16}
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
