@@ -19,6 +19,7 @@ from sb3_belief.baselines.iql import IQL
 from sb3_belief.baselines.others_replay import OthersDictReplayBuffer, OthersReplayBuffer, OthersReplayMixin
 from sb3_belief.belief_ppo.buffers import read_others
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, check_same_others, others_of
+from sb3_belief.common.kept_attributes import kept_attributes
 
 SelfDPIQN = TypeVar("SelfDPIQN", bound="DPIQN")
 
@@ -68,14 +69,11 @@ class DPIQN(IQL):
         is_dict = isinstance(self.observation_space, spaces.Dict)
         self.replay_buffer_class = OthersDictReplayBuffer if is_dict else OthersReplayBuffer
         layout = action_layout(self.others_action_spaces)
-        users = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {**self.policy_kwargs, "others_action_spaces": self.others_action_spaces}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "others_width": layout.width, "n_others": layout.n_others}
-        try:
+        widths = {"others_width": layout.width, "n_others": layout.n_others}
+        with kept_attributes(self, "policy_kwargs", "replay_buffer_kwargs"):
+            self.policy_kwargs = {**self.policy_kwargs, "others_action_spaces": self.others_action_spaces}
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **widths}
             super()._setup_model()
-        finally:
-            # The user's own arguments are what is saved, and compared on load
-            self.policy_kwargs, self.replay_buffer_kwargs = users
         network: Any = self.q_net
         network.inference_floor = self.inference_floor
 

@@ -27,6 +27,7 @@ from sb3_belief.belief_ppo.options import EMBEDDING_DIM, LATENT_DIM, BeliefOptio
 from sb3_belief.belief_ppo.others import ActionSpaces, action_layout, check_same_others, others_of
 from sb3_belief.belief_ppo.others_baseline import take_off
 from sb3_belief.belief_ppo.policies import BeliefPolicyMixin
+from sb3_belief.common.kept_attributes import kept_attributes
 from sb3_belief.common.safe_files.algorithm import SafeFilesMixin
 
 
@@ -109,35 +110,31 @@ class BeliefAlgorithmMixin(SafeFilesMixin, DetailsAlgorithmMixin):
                 f"{type(self).__name__} needs a policy with a belief, not {self.policy_class.__name__}; use 'BeliefPolicy' or "
                 f"derive yours from sb3_belief.belief_ppo.{self.policy_base.__name__}"
             )
-        user_kwargs = self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs
-        plain, for_dicts = self.buffer_classes
-        if self.rollout_buffer_class is None:
-            self.rollout_buffer_class = for_dicts if isinstance(self.observation_space, spaces.Dict) else plain
-        elif not issubclass(self.rollout_buffer_class, BeliefBufferMixin):
-            raise TypeError(
-                f"rollout_buffer_class is {self.rollout_buffer_class.__name__}, which has no place for what a belief is "
-                f"trained on; derive it from sb3_belief.belief_ppo.{plain.__name__} (or {for_dicts.__name__})"
-            )
-        self._warn_of_memory()
-        if issubclass(self.policy_class, self.policy_base):
-            self.policy_kwargs = {
-                "belief_from_features": self.belief_from_features,
-                **self.policy_kwargs,
-                "others_action_spaces": self.others_action_spaces,
-                **asdict(self._options),
-                "value_norm": self.value_norm,
-            }
-        elif not self._value_options.is_of_sb3:
-            raise ValueError(
-                f"value_norm, huber_delta and value_clip need a policy derived from {self.policy_base.__name__}, not"
-                f" {self.policy_class.__name__}"
-            )
-        self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, **self._buffer_widths()}
-        try:
+        with kept_attributes(self, "policy_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"):
+            plain, for_dicts = self.buffer_classes
+            if self.rollout_buffer_class is None:
+                self.rollout_buffer_class = for_dicts if isinstance(self.observation_space, spaces.Dict) else plain
+            elif not issubclass(self.rollout_buffer_class, BeliefBufferMixin):
+                raise TypeError(
+                    f"rollout_buffer_class is {self.rollout_buffer_class.__name__}, which has no place for what a belief is "
+                    f"trained on; derive it from sb3_belief.belief_ppo.{plain.__name__} (or {for_dicts.__name__})"
+                )
+            self._warn_of_memory()
+            if issubclass(self.policy_class, self.policy_base):
+                self.policy_kwargs = {
+                    "belief_from_features": self.belief_from_features,
+                    **self.policy_kwargs,
+                    "others_action_spaces": self.others_action_spaces,
+                    **asdict(self._options),
+                    "value_norm": self.value_norm,
+                }
+            elif not self._value_options.is_of_sb3:
+                raise ValueError(
+                    f"value_norm, huber_delta and value_clip need a policy derived from {self.policy_base.__name__}, not"
+                    f" {self.policy_class.__name__}"
+                )
+            self.rollout_buffer_kwargs = {**self.rollout_buffer_kwargs, **self._buffer_widths()}
             super()._setup_model()
-        finally:
-            # The user's own arguments are what is saved, and compared on load
-            self.policy_kwargs, self.rollout_buffer_class, self.rollout_buffer_kwargs = user_kwargs
         # As SB3 does with its own coefficients that may be schedules
         self.action_coef, self.kl_coef = FloatSchedule(self.action_coef), FloatSchedule(self.kl_coef)
 

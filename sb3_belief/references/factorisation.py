@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 
 from sb3_belief.common.checks import check_integer, check_positive, check_share
+from sb3_belief.common.kept_attributes import kept_attributes
 from sb3_belief.references.agent_net import AgentValues
 from sb3_belief.references.episodes import EpisodeBatch, EpisodeReplayBuffer, lambda_returns
 from sb3_belief.references.factorised_policy import MIXERS, FactorisedPolicy
@@ -132,13 +133,9 @@ class ValueFactorisation(JointLearnerMixin, OffPolicyAlgorithm):
         return {"mixer": self.mixer}
 
     def _setup_model(self) -> None:
-        users = self.policy_kwargs
-        self.policy_kwargs = {**users, **self._policy_arguments()}
-        try:
+        with kept_attributes(self, "policy_kwargs"):
+            self.policy_kwargs = {**self.policy_kwargs, **self._policy_arguments()}
             super()._setup_model()
-        finally:
-            # The user's own arguments are what is saved, and compared on load
-            self.policy_kwargs = users
 
     # Acting
 
