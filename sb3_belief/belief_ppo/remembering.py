@@ -145,8 +145,8 @@ class RememberingMixin(BeliefNetworksMixin):
             if n_steps == 1 and values.shape == shape[1:]:
                 values = values[None]
             # An agent that did nothing may be said to have done anything
-            counts = values if name == "rewards" or acted is None else values[acted] if values.shape == shape else values
-            if values.shape != shape or values.dtype.kind not in "biuf" or not np.isfinite(counts).all():
+            counted = slice(None) if name == "rewards" or acted is None else acted
+            if values.shape != shape or values.dtype.kind not in "biuf" or not np.isfinite(values[counted]).all():
                 raise ValueError(f"{name} must be finite numbers of the shape {shape}, not {values!r}")
             if name == "rewards":
                 own[:, columns] = values[:, None]

@@ -95,6 +95,19 @@ class UnequalTeam(CountingTeam):
         return infos
 
 
+def recorded_logs(model: Any) -> list[dict[str, float]]:
+    """Return a list that is filled with what each further update of a factorised learner logs."""
+    logs: list[dict[str, float]] = []
+    update = model._update
+
+    def record(batch: Any) -> dict[str, float]:
+        logs.append(update(batch))
+        return logs[-1]
+
+    model._update = record
+    return logs
+
+
 def joint_env(n_envs: int = 1, **kwargs: Any) -> JointVecEnv:
     """Return the game as one environment."""
     return JointVecEnv(make_team_env(lambda: CountingTeam(**kwargs), n_envs=n_envs))

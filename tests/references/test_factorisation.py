@@ -12,7 +12,7 @@ from sb3_belief.references.factorisation import ValueFactorisation
 from sb3_belief.references.factorised_policy import MIXERS
 from sb3_belief.references.joint_vec_env import JointVecEnv, joint_team
 from sb3_belief.team import Team, make_team_env
-from tests.references.counting_team import CountingTeam, UnequalTeam, joint_env
+from tests.references.counting_team import CountingTeam, UnequalTeam, joint_env, recorded_logs
 
 
 def learner(env=None, **kwargs):
@@ -140,14 +140,7 @@ def test_the_loss_is_the_mean_over_the_steps_that_exist():
 def test_steps_that_do_not_exist_may_have_any_masks(mixer, kwargs):
     env = JointVecEnv(make_team_env(lambda: UnequalTeam(**kwargs), n_envs=2))
     model = learner(env, mixer=mixer, batch_size=4)
-    losses: list[dict[str, float]] = []
-    update = model._update
-
-    def record(batch):
-        losses.append(update(batch))
-        return losses[-1]
-
-    model._update = record
+    losses = recorded_logs(model)
     model.learn(60)
     assert {len(episode["rewards"]) for episode in model.replay_buffer.episodes} == {3, 4, 5}
     assert losses and np.isfinite([list(each.values()) for each in losses]).all() and weights(model).isfinite().all()

@@ -14,7 +14,7 @@ from sb3_belief.references.joint_vec_env import JointVecEnv, joint_team
 from sb3_belief.references.rode import RODE
 from sb3_belief.references.rode_policy import RodeValue
 from sb3_belief.references.roles import ActionEffects, group_actions
-from tests.references.counting_team import CountingTeam, UnequalTeam, joint_env
+from tests.references.counting_team import CountingTeam, UnequalTeam, joint_env, recorded_logs
 from tests.team.exact.test_exact import SaveOnce
 from tests.team.helpers import Team, make_team_env, parameters
 
@@ -272,14 +272,7 @@ def test_roles_wait_for_embeddings_that_have_been_trained():
 @pytest.mark.parametrize("kwargs", [{}, {"truncates": True}, {"nothing": True}], ids=["ends", "limits", "nothing is legal"])
 def test_steps_that_do_not_exist_may_have_any_masks(kwargs):
     model = learner(JointVecEnv(make_team_env(lambda: UnequalTeam(**kwargs), n_envs=2)), batch_size=4, role_start=20)
-    logs: list[dict[str, float]] = []
-    update = model._update
-
-    def record(batch):
-        logs.append(update(batch))
-        return logs[-1]
-
-    model._update = record
+    logs = recorded_logs(model)
     model.learn(120)
     assert any("role_loss" in log for log in logs) and np.isfinite([value for log in logs for value in log.values()]).all()
     assert th.as_tensor(parameters(model)).isfinite().all()
