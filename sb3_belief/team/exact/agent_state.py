@@ -147,12 +147,14 @@ def _buffers(model: BaseAlgorithm) -> Iterator[tuple[str, BaseBuffer]]:
 
 
 def _buffer_state(buffer: BaseBuffer) -> dict[str, Any]:
-    parts = lasting_parts(buffer) if isinstance(buffer, RolloutBuffer) else vars(buffer)
-    values = {name: value for name, value in parts.items() if not (isinstance(value, _NO_STATE) or callable(value))}
     if isinstance(buffer, RolloutBuffer):
-        return values
+        return _states_in(lasting_parts(buffer))
     n_rows = buffer.buffer_size if buffer.full else buffer.pos + 1
-    return {name: _first_rows(value, n_rows, buffer.buffer_size) for name, value in values.items()}
+    return {name: _first_rows(value, n_rows, buffer.buffer_size) for name, value in _states_in(vars(buffer)).items()}
+
+
+def _states_in(parts: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in parts.items() if not (isinstance(value, _NO_STATE) or callable(value))}
 
 
 def _first_rows(value: Any, n_rows: int, size: int) -> Any:
